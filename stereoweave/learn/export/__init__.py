@@ -1,1 +1,1 @@
-"""From a checkpoint to a matcher file."""
+"""Export of trained networks as matcher files."""

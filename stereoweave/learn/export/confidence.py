@@ -23,9 +23,10 @@ _SIZE = (320, 512)
 def calibrate_confidence(network: WeaveNet) -> dict[str, Any]:
     """Calibrate the network's confidence in place. Returns its reliability on other pairs.
 
-    Scale and shift of the logits (Platt 1999) are folded into the last layers. Reliability is measured on
-    pairs that were not used for fitting: `calibration_error`, and per confidence bin the `claimed` and the
-    observed (`happened`) share within 1 px, and the `share` of pixels.
+    A scale and a shift of the logits (Platt 1999) are fitted and folded into the last layers. Reliability is
+    measured on pairs that were not used for the fit. It consists of the `calibration_error` and, for each
+    confidence bin, the `claimed` probability of an error within 1 px, how often that `happened`, and the
+    bin's `share` of all pixels.
     """
     scale, shift = _fit_scale_and_shift(*_predict_claims(network, _FIT_SEED))
     with torch.no_grad():
@@ -40,20 +41,20 @@ def calibrate_confidence(network: WeaveNet) -> dict[str, Any]:
 
 
 def measure_reliability(probability: np.ndarray, happened: np.ndarray) -> dict[str, Any]:
-    """Claimed and observed probability per bin of equal width, and the expected calibration error."""
+    """Return claimed and observed probability per bin of equal width, and the expected calibration error."""
     bins = calibration_bins(probability, happened).round(4).T.tolist()
     rows = [dict(zip(("claimed", "happened", "share"), row, strict=True)) for row in bins]
     return {"calibration_error": round(calibration_error(probability, happened), 4), "bins": rows}
 
 
 def paint_unseen_pair() -> StereoPair:
-    """Paint a collage that no training uses."""
+    """Paint a collage that is never used in training."""
     made = paint_collage(_PROOF_SEED, 1, 0, *_SIZE)
     return StereoPair(left=made.left, right=made.right)
 
 
 def _predict_claims(network: WeaveNet, seed: int) -> tuple[Tensor, Tensor]:
-    """Confidence logits, and whether the disparity is within 1 px, at every 29th pixel of held-out pairs."""
+    """Return confidence logits, and whether disparity is within 1 px, at every 29th pixel of unseen pairs."""
     logits, within = [], []
     for index in range(_PAIRS):
         made = paint_collage(seed, 0, index, *_SIZE)
@@ -86,15 +87,15 @@ def _fit_scale_and_shift(logits: Tensor, within: Tensor) -> tuple[float, float]:
 
 
 def draw_reliability(reliability: dict[str, Any], picture: Path) -> None:
-    """Plot claimed against observed probability, with the share of pixels below."""
+    """Plot observed against claimed probability, with the share of pixels in each bin below."""
     from matplotlib.figure import Figure
 
     bins = reliability["bins"]
     claimed, happened, share = ([row[key] for row in bins] for key in ("claimed", "happened", "share"))
     figure = Figure(figsize=(4.5, 5.5), layout="constrained")
     above, below = figure.subplots(2, 1, height_ratios=(3, 1), sharex=True)
-    above.plot([0, 1], [0, 1], color="0.7", linestyle="--", label="as claimed")
-    above.plot(claimed, happened, marker="o", label="as it happened")
+    above.plot([0, 1], [0, 1], color="0.7", linestyle="--", label="perfect calibration")
+    above.plot(claimed, happened, marker="o", label="measured")
     above.set(ylabel="share within 1 px", xlim=(0, 1), ylim=(0, 1))
     above.set_title(f"expected calibration error {reliability['calibration_error']:.3f}")
     above.legend(loc="upper left", frameon=False)

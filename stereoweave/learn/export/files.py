@@ -1,4 +1,4 @@
-"""The matcher files of `stereoweave export`, from a trained network or another matcher file."""
+"""Matcher files of `stereoweave export`, made from a trained network or another matcher file."""
 
 import shutil
 import tempfile
@@ -27,7 +27,7 @@ class MatcherFiles:
         out: The .onnx file in float32.
         half: The .onnx file in float16.
         eight_bits: The .onnx file with 8-bit convolutions.
-        size: The only width and height that the files accept; None for any size.
+        size: The only width and height that the files accept; None if they accept any size.
     """
 
     out: Path | None = None
@@ -55,13 +55,13 @@ class MatcherFiles:
 def write_matcher_files(
     source: str, files: MatcherFiles, pairs: Iterable[StereoPair] = (), reliability: Path | None = None
 ) -> Iterator[str]:
-    """Write the files. Yields a note on each.
+    """Write the matcher files and yield a note about each.
 
     Args:
-        source: Run folder, checkpoint, shipped model, or float32 matcher file for any size.
+        source: Run folder, checkpoint, shipped model, or float32 matcher file for pairs of any size.
         files: The files to write.
-        pairs: For a trained network: pairs on which ONNX Runtime and PyTorch must agree.
-        reliability: For a trained network: file for a plot of the confidence's reliability.
+        pairs: Pairs on which ONNX Runtime and PyTorch must agree; used only for a trained network.
+        reliability: File for a reliability diagram of the confidence; used only for a trained network.
     """
     for file in files.paths:
         make_parent_folder(file)
@@ -82,13 +82,13 @@ def write_weights(run: Path, out: Path) -> str:
 
     Args:
         run: Folder of a run, or a checkpoint.
-        out: The .pt file.
+        out: The .pt file to write.
 
     Raises:
         StereoweaveError: `run` has no checkpoint, or `out` does not end in .pt.
     """
     if out.suffix != ".pt":
-        raise StereoweaveError(f"{out}: expected a name that ends in .pt, as start_from takes it")
+        raise StereoweaveError(f"{out}: expected a name that ends in .pt")
     kept = checkpoint.load(run / "last.pt" if run.is_dir() else run)
     make_parent_folder(out)
     checkpoint.save(checkpoint.strip_to_average(kept), out)
@@ -96,7 +96,7 @@ def write_weights(run: Path, out: Path) -> str:
 
 
 def is_matcher(source: str) -> bool:
-    """Whether an export's source is a matcher file or shipped model instead of a trained network."""
+    """Return whether an export's source is a matcher file or shipped model, not a trained network."""
     return source.endswith(".onnx") or source in shipped_models()
 
 

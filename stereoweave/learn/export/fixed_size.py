@@ -1,4 +1,4 @@
-"""Matcher files for a single pair of one fixed size, as TensorRT and small devices need them."""
+"""Matcher files with a batch size of 1 and a fixed image size, as TensorRT and small devices require."""
 
 import copy
 from pathlib import Path
@@ -13,14 +13,15 @@ from stereoweave.io.images import SMALLEST_SIDE_PX
 from stereoweave.learn.export.graph import write_card
 from stereoweave.matching.matcher import Matcher
 
-# Operators that runtimes with fixed shapes cannot plan: shapes or control flow depend on values.
+# Operators whose shapes or control flow depend on values, which runtimes with fixed shapes cannot plan.
 SHAPES_BY_VALUE = ("If", "Loop", "NonZero", "Range", "Scan", "Shape", "Unique")
 
 
 def fix_size(source: Path, out: Path, width: int, height: int) -> dict[str, Any]:
-    """Write a matcher file for one pair of the given size, and its card as .json. Returns the card.
+    """Write a matcher file for single pairs of the given size, and its card as .json. Returns the card.
 
-    It computes the same values; all shapes in it are constants, and no operator computes shapes.
+    The new file computes the same values as the source. All shapes in its graph are constants, so no
+    operator computes one.
 
     Args:
         source: Matcher file for pairs of any size, in float32, 16 or 8 bits.
@@ -52,20 +53,20 @@ def check_size(width: int, height: int, multiple_of: int) -> None:
     if min(width, height) < SMALLEST_SIDE_PX or width % multiple_of or height % multiple_of:
         suggested = "x".join(str(max(-(-x // multiple_of), 2) * multiple_of) for x in (width, height))
         raise StereoweaveError(
-            f"expected multiples of {multiple_of} of at least {SMALLEST_SIDE_PX}, found {width}x{height}; "
-            f"choose {suggested}, to which smaller pictures are padded",
+            f"expected multiples of {multiple_of} that are at least {SMALLEST_SIDE_PX}, "
+            f"found {width}x{height}; choose {suggested}, to which smaller pictures are padded",
             setting="size",
         )
 
 
 def fix_graph_size(graph: onnx.ModelProto, width: int, height: int) -> onnx.ModelProto:
-    """The graph for one pair of the given size, with all shapes as constants."""
+    """Return the graph for single pairs of the given size, with all shapes as constants."""
     graph = copy.deepcopy(graph)
     for value in (*graph.graph.input, *graph.graph.output):
         sides = value.type.tensor_type.shape.dim
         for side, length in zip(sides, (1, sides[1].dim_value, height, width), strict=True):
             side.dim_value = length
-    del graph.graph.value_info[:]  # shapes for any size
+    del graph.graph.value_info[:]  # it describes shapes for any size
     made = optimizer.optimize(graph)
     onnx.checker.check_model(made, full_check=True)
     left = sorted({node.op_type for node in made.graph.node} & set(SHAPES_BY_VALUE))

@@ -1,4 +1,4 @@
-"""Matcher files in float16: half the size, and faster on processors with native float16."""
+"""Matcher files in float16: half as large, and faster on processors with native float16."""
 
 from collections.abc import Set
 from pathlib import Path
@@ -40,8 +40,8 @@ def convert_to_float16(source: Path, out: Path) -> dict[str, Any]:
         mean_px = _mean_difference_px(Matcher(source), Matcher(temporary))
         if not mean_px < LARGEST_MEAN_DIFFERENCE_PX:
             raise StereoweaveError(
-                f"{source}: 16 bits change disparity by {mean_px:.3f} px on average, expected under "
-                f"{LARGEST_MEAN_DIFFERENCE_PX}; nothing was written"
+                f"{source}: expected 16 bits to change disparity by less than "
+                f"{LARGEST_MEAN_DIFFERENCE_PX} px on average, found {mean_px:.3f} px; nothing was written"
             )
     return write_card(
         source, out, {"bits": 16, "differs_px_from_32_bits": mean_px, "compared_pairs": _PROOF_PAIRS}
@@ -49,12 +49,13 @@ def convert_to_float16(source: Path, out: Path) -> dict[str, Any]:
 
 
 def select_float16_nodes(graph: onnx.ModelProto) -> set[str]:
-    """Names of the nodes that compute in float16.
+    """Return the names of the nodes to compute in float16.
 
-    These are the convolutions, the matrix products that correlate the views, and nodes between them.
-    Everything that reads or writes a disparity stays in float32: at 192 px float16 has a resolution of 1/8
-    px. So does the sum of matching scores from which the disparity is read. On painted pairs, converting
-    everything else too leaves the mean difference unchanged and increases the largest one.
+    They are the convolutions, the matrix products that correlate the views, and the nodes between them.
+    Everything that reads or writes a disparity stays in float32, because at 192 px float16 has a resolution
+    of only 1/8 px. The sum of matching scores from which the disparity is read also stays in float32. On
+    painted pairs, converting all other nodes as well leaves the mean difference unchanged and increases the
+    largest one.
     """
     products = (node.name for node in graph.graph.node if node.op_type in ("Conv", "MatMul"))
     between = ("Concat", "Resize", "Relu", "Add", "Slice", "Pad", "Transpose")
@@ -85,12 +86,12 @@ def cast_to_float16(graph: onnx.ModelProto, names: Set[str]) -> onnx.ModelProto:
 
 
 def _takes_float16(node: onnx.NodeProto, place: int, names: Set[str]) -> bool:
-    """Whether a node takes this input in float16. The scale of a Resize stays in float32."""
+    """Return whether a node takes this input in float16. The scale of a Resize stays in float32."""
     return node.name in names and not (node.op_type == "Resize" and place > 0)
 
 
 class _Casts:
-    """Cast nodes and converted weights, each made once."""
+    """Cast nodes and converted weights, each created only once."""
 
     def __init__(self, graph: onnx.ModelProto, names: Set[str]) -> None:
         inferred = onnx.shape_inference.infer_shapes(graph).graph
@@ -104,7 +105,7 @@ class _Casts:
         self.weights: list[TensorProto] = []
 
     def half(self, value: str) -> str:
-        """Name of the value in float16; the value itself if it is not a float or already in float16."""
+        """Return the name of the value in float16, or its own name if it needs no conversion."""
         if value in self._stored:
             return self._weight(value)
         if value in self._floats - self._halves:
@@ -112,11 +113,11 @@ class _Casts:
         return value
 
     def single(self, value: str) -> str:
-        """Name of the value in float32."""
+        """Return the name of the value in float32."""
         return self._cast(value, "single", TensorProto.FLOAT) if value in self._halves else value
 
     def take(self) -> list[onnx.NodeProto]:
-        """Return the casts requested since the last call."""
+        """Return the Cast nodes requested since the last call."""
         taken, self._nodes = self._nodes, []
         return taken
 
@@ -137,7 +138,7 @@ class _Casts:
 
 
 def _mean_difference_px(first: Matcher, second: Matcher) -> float:
-    """Mean absolute difference of two matchers' disparities on held-out pairs."""
+    """Return the mean absolute difference between two matchers' disparities on held-out pairs."""
     pairs = (paint_collage(_PROOF_SEED, 0, index, *_SIZE) for index in range(_PROOF_PAIRS))
     differences_px = [
         np.abs(

@@ -1,4 +1,4 @@
-"""From a checkpoint to a matcher file: calibrate, export, and verify that it agrees with PyTorch."""
+"""Export of a checkpoint as a matcher file: calibrate, convert, and verify agreement with PyTorch."""
 
 import json
 import logging
@@ -27,9 +27,9 @@ from stereoweave.learn.training.objective import CodeObjective
 from stereoweave.matching.matcher import Matcher
 from stereoweave.stereo import StereoPair
 
-# WeaveNet has all of these outputs; the paper's network and its rivals only the first.
+# WeaveNet has all of these outputs; the paper's network and its rivals have only the first.
 OUTPUTS = ["disparity_px", "right_disparity_px", "confidence_logit"]
-# The two runtimes may differ by rounding, but by no more than this.
+# Rounding makes PyTorch and ONNX Runtime differ, but by less than these limits.
 LARGEST_DIFFERENCE_PX = 0.01
 LARGEST_DIFFERENCE_OF_CONFIDENCE = 0.01
 
@@ -40,10 +40,10 @@ def export_matcher(trained: Path, out: Path, pairs: Iterable[StereoPair] = ()) -
     Args:
         trained: Checkpoint, or folder of a run, whose last checkpoint is used.
         out: The .onnx file.
-        pairs: Pairs on which ONNX Runtime and PyTorch must agree, besides one collage.
+        pairs: Pairs on which ONNX Runtime and PyTorch must agree, in addition to one collage.
 
     Raises:
-        StereoweaveError: They differ by 0.01 px, or by 0.01 in confidence, or more; nothing is written.
+        StereoweaveError: The two differ by at least 0.01 px or 0.01 in confidence; nothing is written.
     """
     kept = checkpoint.load(trained / "last.pt" if trained.is_dir() else trained)
     network = load_matcher_network(kept)
@@ -58,9 +58,9 @@ def export_matcher(trained: Path, out: Path, pairs: Iterable[StereoPair] = ()) -
         px, of_confidence = np.max(found, axis=0).tolist()
         if not (px < LARGEST_DIFFERENCE_PX and of_confidence < LARGEST_DIFFERENCE_OF_CONFIDENCE):
             raise StereoweaveError(
-                f"{trained}: ONNX Runtime and PyTorch differ by {px:.3f} px and {of_confidence:.3f} of "
-                f"confidence, expected under {LARGEST_DIFFERENCE_PX} and {LARGEST_DIFFERENCE_OF_CONFIDENCE}; "
-                "nothing was written"
+                f"{trained}: ONNX Runtime and PyTorch differ by {px:.3f} px and by {of_confidence:.3f} in "
+                f"confidence, expected less than {LARGEST_DIFFERENCE_PX} px and "
+                f"{LARGEST_DIFFERENCE_OF_CONFIDENCE}; nothing was written"
             )
     agreement = {
         "onnx_differs_px": px,
@@ -74,7 +74,7 @@ def export_matcher(trained: Path, out: Path, pairs: Iterable[StereoPair] = ()) -
 
 
 class DisparityNetwork(nn.Module):
-    """A `CodeNetwork` as a matcher: disparity of the left view in pixels, [B, 1, H, W]."""
+    """A `CodeNetwork` as a matcher, whose output is the left view's disparity in pixels [B, 1, H, W]."""
 
     def __init__(self, network: Any, recipe: Recipe) -> None:
         super().__init__()
@@ -99,13 +99,13 @@ def load_matcher_network(kept: Checkpoint) -> Any:
         return network
     if kept.recipe.target != "disparity":
         raise StereoweaveError(
-            f"{kept.recipe.name}: a matcher file gives disparity, expected target = 'disparity', found "
-            f"{kept.recipe.target!r}; the network needs each pair's camera"
+            f"{kept.recipe.name}: expected target = 'disparity', found {kept.recipe.target!r}; "
+            "a matcher file has no camera to convert depth to disparity"
         )
     if isinstance(network, PSMNet):
         raise StereoweaveError(
-            f"{kept.recipe.name}: a matcher file serves pairs of any size, expected another network, "
-            "found psmnet, whose pooling windows depend on the size; score it by stereoweave bench networks"
+            f"{kept.recipe.name}: expected a network for pairs of any size, found psmnet, whose pooling "
+            "windows depend on the size; score it with `stereoweave bench networks`"
         )
     return DisparityNetwork(network, kept.recipe)
 
@@ -113,14 +113,15 @@ def load_matcher_network(kept: Checkpoint) -> Any:
 def export_graph(network: Any, kept: Checkpoint) -> onnx.ModelProto:
     """Export the network as an ONNX graph with a matcher's metadata, for any batch, height and width.
 
-    Height and width are multiples of the network's. The free batch size costs under 1 %, within noise.
+    Height and width must be multiples of `network.multiple_of`. The dynamic batch size increases the run time
+    by less than 1 %, which is within noise.
     """
     height, width = (network.multiple_of * torch.export.Dim(name, min=2, max=1024) for name in ("h", "w"))
     sides = {0: torch.export.Dim("batch"), 2: height, 3: width}
     graph = _export_clean_graph(network, 4 * network.multiple_of, 8 * network.multiple_of, (sides, sides))
     first, *_ = graph.graph.input[0].type.tensor_type.shape.dim
-    # The exporter does not report if a network's code fixes a free dimension.
-    assert first.dim_param, "the network's code fixes the number of pairs"
+    # The exporter does not report if a network's code fixes a dynamic dimension.
+    assert first.dim_param, "the network's code fixes the batch size"
     properties = {
         "name": kept.recipe.name,
         "multiple_of": network.multiple_of,
@@ -141,8 +142,8 @@ def export_fixed_graph(network: Any, height: int, width: int) -> onnx.ModelProto
 
 def export_annotated_graph(network: Any, height: int, width: int, dynamic_shapes: Any) -> onnx.ModelProto:
     """Export the network as an ONNX graph, with the exporter's notes on the origin of each node."""
-    # Two tensors: the exporter merges inputs that are the same tensor. Two pairs if the batch size is free:
-    # an axis of 1 would be fixed.
+    # Two tensors, because the exporter merges inputs that are the same tensor. Two pairs if the batch size is
+    # dynamic, because the exporter would fix an axis of length 1.
     left, right = torch.rand(2, 1 if dynamic_shapes is None else 2, 3, height, width)
     with _mute_exporter(), torch.no_grad():
         program = torch.onnx.export(
@@ -172,7 +173,7 @@ def _export_clean_graph(network: Any, height: int, width: int, dynamic_shapes: A
 
 @contextmanager
 def _mute_exporter() -> Iterator[None]:
-    """Suppress the exporter's warnings about torchvision's operators and names of repeated axes."""
+    """Suppress the exporter's warnings about torchvision's operators and about repeated axis names."""
     logger = logging.getLogger("torch.onnx")
     level = logger.level
     logger.setLevel(logging.ERROR)
@@ -184,14 +185,14 @@ def _mute_exporter() -> Iterator[None]:
 
 
 def compare_runtimes(network: Any, matcher: Matcher, pair: StereoPair) -> tuple[float, float]:
-    """Largest differences of PyTorch and ONNX Runtime: both disparities in px, and confidence."""
+    """Return the largest differences between PyTorch and ONNX Runtime, in disparity (px) and confidence."""
     multiple = network.multiple_of
     height, width = (side // multiple * multiple for side in pair.left.shape[:2])
     left, right = pair.left[:height, :width], pair.right[:height, :width]
     tensors = [torch.from_numpy(x).permute(2, 0, 1)[None].float() / 255 for x in (left, right)]
     with torch.no_grad():
         expected = [x[0, 0] for x in network(*tensors)]
-    # In one piece, because large pairs are matched in strips, with slightly different results.
+    # In one piece: `estimate` would match large pairs in strips, with slightly different results.
     found = [torch.from_numpy(x) for x in matcher._run(left, right) if x is not None]
     largest_px = max(float((found[i] - x).abs().max()) for i, x in enumerate(expected[:2]))
     if len(expected) < len(OUTPUTS):
@@ -207,8 +208,8 @@ def count_multiply_adds(network: nn.Module, height: int = 480, width: int = 640)
     counted = counter.get_total_flops() // 2
     if not isinstance(network, WeaveNet):
         return counted
-    # The counter covers convolutions and matrix products. The refinement correlates both views by elementwise
-    # products, at one more column than it has matches if it interpolates between products.
+    # The counter covers only convolutions and matrix products, but the refinement correlates both views by
+    # elementwise products. To interpolate between products, it needs one more column than it has matches.
     nearby = 2 * network.refinement.radius + 1 + (not network.size.warps)
     counted += 2 * (height // 2) * (width // 2) * network.size.compared * nearby
     if network.sharpening is None:

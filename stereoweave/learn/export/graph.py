@@ -1,4 +1,4 @@
-"""Matcher files as ONNX graphs, the basis of the float16, 8-bit and fixed-size variants."""
+"""ONNX graphs of matcher files, from which the float16, 8-bit and fixed-size variants are made."""
 
 import json
 from collections import defaultdict
@@ -18,7 +18,7 @@ def read_graph(source: Path) -> onnx.ModelProto:
     """Read the graph of a float32 matcher file for pairs of any size.
 
     Raises:
-        StereoweaveError: The file is not a matcher file, or is a variant.
+        StereoweaveError: The file is not a matcher file, or is already a variant.
     """
     fixed_size = Matcher(source).fixed_size
     graph = onnx.load(source)
@@ -48,13 +48,16 @@ def write_card(source: Path, out: Path, facts: dict[str, Any]) -> dict[str, Any]
 
 
 def add_nodes_between(graph: onnx.ModelProto, names: Iterable[str], operations: tuple[str, ...]) -> set[str]:
-    """Add nodes of the given operations that only the named nodes read, and ReLUs of convolutions."""
+    """Return the named nodes, the nodes between them, and the ReLUs after their convolutions.
+
+    A node of the given operations counts as between them if only chosen nodes read its outputs.
+    """
     readers = defaultdict(list)
     for node in graph.graph.node:
         for value in node.input:
             readers[value].append(node)
     chosen = set(names)
-    # Backwards: a node is between chosen ones if all its readers are chosen.
+    # In reverse order, so that the readers of a node are decided before the node itself.
     for node in reversed(graph.graph.node):
         following = {reader.name for value in node.output for reader in readers[value]}
         if node.op_type in operations and following and following <= chosen:

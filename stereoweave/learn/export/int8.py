@@ -30,17 +30,19 @@ LARGEST_LOSS_PX = 0.05
 _RANGES_SEED, _PROOF_SEED = 4_000_037, 5_000_011
 _RANGES_PAIRS, _PROOF_PAIRS = 6, 24
 _SIZE = (320, 512)
-# Percentile of a map's values that the range covers; outliers are clipped, so that steps stay fine.
+# Percentile of a map's values that its quantisation range covers. Outliers are clipped to keep steps small.
 _RANGE_PERCENTILE = 99.99
-# These layers stay in float32, because they resolve fractions of a pixel: in 8 bits they double the loss.
+# These layers stay in float32, because they resolve fractions of a pixel; in 8 bits they would double the
+# loss.
 _KEPT = ("refinement.", "sharpening.")
 
 
 def quantise(source: Path, out: Path) -> dict[str, Any]:
     """Write a WeaveNet's matcher file with 8-bit convolutions, and its card as .json. Returns the card.
 
-    Activations take 8 bits, weights 7 of 8 with a scale per channel: with all 8, sums of two products
-    overflow on CPUs with AVX2 but without 8-bit dot products (ONNX Runtime, "Quantize ONNX Models").
+    Activations use 8 bits. Weights use 7 of their 8 bits, with one scale per channel: with all 8 bits, sums
+    of two products overflow on CPUs that have AVX2 but no 8-bit dot products (ONNX Runtime, "Quantize ONNX
+    Models").
 
     Args:
         source: Matcher file in float32 for pairs of any size.
@@ -48,7 +50,7 @@ def quantise(source: Path, out: Path) -> dict[str, Any]:
 
     Raises:
         StereoweaveError: The source is not such a file, or the mean error grows by 0.05 px or more on pairs
-            that were not used for the ranges; nothing is written.
+            that did not determine the quantisation ranges; nothing is written.
     """
     graph = read_graph(source)
     make_folder(out.parent)
@@ -57,8 +59,8 @@ def quantise(source: Path, out: Path) -> dict[str, Any]:
         before_px, after_px = (_mean_error_px(Matcher(file)) for file in (source, temporary))
         if not after_px - before_px < LARGEST_LOSS_PX:
             raise StereoweaveError(
-                f"{source}: 8 bits cost {after_px - before_px:.3f} px of mean error, expected under "
-                f"{LARGEST_LOSS_PX}; nothing was written"
+                f"{source}: expected 8 bits to increase the mean error by less than {LARGEST_LOSS_PX} px, "
+                f"found {after_px - before_px:.3f} px; nothing was written"
             )
     return write_card(
         source,
@@ -68,10 +70,11 @@ def quantise(source: Path, out: Path) -> dict[str, Any]:
 
 
 def select_int8_nodes(graph: onnx.ModelProto) -> list[str]:
-    """Names of the nodes that compute in 8 bits.
+    """Return the names of the nodes to compute in 8 bits.
 
-    These are all convolutions except those of refinement and sharpening, and nodes that only such nodes read.
-    Disparities, correlations and their inputs stay in float32: 8 bits of a disparity are integer pixels.
+    They are all convolutions except those of refinement and sharpening, and nodes that only these nodes read.
+    Disparities, correlations and their inputs stay in float32, because 8 bits would round a disparity to
+    whole pixels.
     """
     convolutions = (
         node.name
@@ -83,7 +86,7 @@ def select_int8_nodes(graph: onnx.ModelProto) -> list[str]:
 
 
 class _CalibrationPairs(CalibrationDataReader):  # type: ignore[misc]
-    """Pairs in the form in which ONNX Runtime's calibration reads them."""
+    """Pairs in the format that ONNX Runtime's calibration reads."""
 
     def __init__(self, pairs: Iterable[Sample]) -> None:
         self._pairs = iter(pairs)
@@ -100,7 +103,7 @@ class _CalibrationPairs(CalibrationDataReader):  # type: ignore[misc]
 
 def _write(graph: onnx.ModelProto, out: Path) -> None:
     nodes = select_int8_nodes(graph)
-    # Suppresses ONNX Runtime's progress messages.
+    # Redirected to suppress ONNX Runtime's progress messages.
     with tempfile.TemporaryDirectory() as folder, redirect_stdout(io.StringIO()):
         with_shapes = Path(folder, "with_shapes.onnx")
         quant_pre_process(graph, with_shapes, skip_optimization=True, skip_symbolic_shape=True)
@@ -124,7 +127,7 @@ def _paint_pairs(seed: int, count: int) -> Iterator[Sample]:
 
 
 def _mean_error_px(matcher: Matcher) -> float:
-    """Mean error on held-out pairs, over pixels visible in both views."""
+    """Return the mean disparity error on held-out pairs, over pixels visible in both views."""
     errors_px = [
         np.abs(matcher.estimate(pair.left, pair.right).disparity_px - pair.disparity_px)[
             ~pair.occluded

@@ -1,4 +1,4 @@
-"""Accuracy of each runtime and variant of a shipped network relative to PyTorch in float32, and its speed."""
+"""Accuracy and speed of the shipped networks in every variant and runtime, relative to PyTorch in float32."""
 
 import contextlib
 import math
@@ -38,7 +38,7 @@ _TURNS = 7
 
 @dataclass(frozen=True, kw_only=True)
 class ParityRow:
-    """Differences of one variant from PyTorch in float32, over all pixels of painted pairs.
+    """Differences between one variant and PyTorch in float32, over all pixels of painted pairs.
 
     Attributes:
         network: The shipped network.
@@ -50,8 +50,8 @@ class ParityRow:
         left_mean_px, left_max_px: Absolute differences of the left view's disparity.
         right_mean_px, right_max_px: Absolute differences of the right view's disparity.
         confidence_mean, confidence_max: Absolute differences of the confidence, a probability.
-        time_ms: Time of a pair of 640x480, the shortest of several runs.
-        time_relative: Time relative to float32 on the same provider, measured alternately.
+        time_ms: Shortest time for a pair of 640x480 over several runs.
+        time_relative: Time relative to float32 on the same provider, measured in alternation.
         commit: Commit of the code.
     """
 
@@ -73,7 +73,7 @@ class ParityRow:
 
 
 class MatcherVariant(NamedTuple):
-    """A matcher file, the batch size it is run with, and the sizes of SIZES that it accepts."""
+    """A matcher file, the batch size at which it is run, and the entries of SIZES that it accepts."""
 
     file: Path
     batch: int
@@ -153,7 +153,7 @@ def _measure_network(path: Path, folder: Path) -> list[ParityRow]:
 
 
 def make_variants(file: Path, folder: Path) -> dict[str, MatcherVariant]:
-    """Make every variant of a shipped matcher file, by name; derived files go to the folder."""
+    """Return every variant of a shipped matcher file by name; derived files are written to `folder`."""
     height, width = SIZES[-1]
     half, eight_bits, fixed = (folder / f"{file.stem}_{x}.onnx" for x in ("fp16", "8bit", "fixed"))
     convert_to_float16(file, half)
@@ -180,7 +180,7 @@ def apply_shipped_calibration(network: WeaveNet, file: Path) -> WeaveNet:
 
 
 def paint_pairs(size: tuple[int, int], count: int) -> dict[str, Float32[np.ndarray, "b 3 h w"]]:
-    """Paint held-out pairs as a network's inputs: stacked left views and right views."""
+    """Paint held-out pairs as a network's inputs: a batch of left views and a batch of right views."""
     made = [paint_collage(_SEED, size[1], index, *size) for index in range(count)]
     return {
         side: np.stack([getattr(x, side).transpose(2, 0, 1) for x in made]).astype(np.float32) / 255
@@ -211,7 +211,7 @@ def run_in_onnx_runtime(session: Any, batch: int, views: Mapping[str, np.ndarray
 def summarise_differences(
     expected: Mapping[tuple[int, int], NetworkMaps], found: Mapping[tuple[int, int], NetworkMaps]
 ) -> dict[str, float]:
-    """Mean and largest absolute differences over all pixels of all sizes, by the row's fields."""
+    """Return mean and largest absolute differences over all pixels of all sizes, keyed by field of a row."""
     summary = {}
     for field, unit in (("left", "_px"), ("right", "_px"), ("confidence", "")):
         name = field + unit
@@ -222,13 +222,13 @@ def summarise_differences(
 
 
 def list_providers() -> list[str]:
-    """The providers of the installed ONNX Runtime."""
+    """Return the providers of the installed ONNX Runtime."""
     there = onnxruntime.get_available_providers()
     return [name for name, provider in PROVIDERS.items() if provider.name in there]
 
 
 def _open_sessions(made: Mapping[str, MatcherVariant], provider: str) -> dict[str, Any]:
-    """ONNX Runtime's sessions by variant, without those that a provider other than the CPU rejects."""
+    """Open a session for each variant, except variants that a provider other than the CPU rejects."""
     sessions = {}
     for name, variant in made.items():
         with contextlib.nullcontext() if provider == CPU else contextlib.suppress(MatcherError):
@@ -239,9 +239,12 @@ def _open_sessions(made: Mapping[str, MatcherVariant], provider: str) -> dict[st
 def _measure_times_ms(
     sessions: Mapping[str, Any], made: Mapping[str, MatcherVariant], views: Mapping[str, np.ndarray]
 ) -> dict[str, float]:
-    """Shortest time per pair, measured alternately, so that slow phases affect all variants alike."""
+    """Return each variant's shortest time per pair.
+
+    The variants run in alternation, so slow phases of the machine affect all of them alike.
+    """
     times_ms: dict[str, list[float]] = {name: [] for name in sessions}
-    for turn in range(-1, _TURNS):  # the first one warms up
+    for turn in range(-1, _TURNS):  # turn -1 is a warm-up
         for name, session in sessions.items():
             batch = {side: x[: made[name].batch] for side, x in views.items()}
             start_s = time.perf_counter()

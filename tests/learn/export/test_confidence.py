@@ -24,7 +24,7 @@ def test_the_fit_recovers_a_known_scale_and_shift(scale, shift):
     assert calibrate._fit_scale_and_shift(logits, within) == pytest.approx((scale, shift), abs=0.05)
 
 
-def test_reliability_compares_what_was_claimed_with_what_happened():
+def test_reliability_compares_claimed_with_observed_probability():
     probability = np.array([0.11, 0.13, 0.95, 1.0, 0.95, 0.9])
     happened = np.array([False, True, True, True, True, False])
     found = calibrate.measure_reliability(probability, happened)
@@ -33,7 +33,7 @@ def test_reliability_compares_what_was_claimed_with_what_happened():
         {"claimed": 0.9, "happened": 0.0, "share": 0.1667},
         {"claimed": 0.9667, "happened": 1.0, "share": 0.5},
     ]
-    # The error is that of the same bins: (2 * 0.38 + 1 * 0.9 + 3 * 0.0333) / 6.
+    # The error of the same bins is (2 * 0.38 + 1 * 0.9 + 3 * 0.0333) / 6.
     assert found["calibration_error"] == 0.2933
 
 
@@ -64,7 +64,7 @@ def test_calibration_scales_and_shifts_the_confidence_and_leaves_the_disparity()
 
 
 @pytest.mark.usefixtures("few_small_pairs")
-def test_the_unseen_pair_is_none_of_those_of_the_fit_or_the_proof():
+def test_the_unseen_pair_differs_from_those_of_the_fit_and_the_proof():
     unseen = calibrate.paint_unseen_pair()
     for seed in (calibrate._FIT_SEED, calibrate._PROOF_SEED):
         assert (calibrate.paint_collage(seed, 0, 0, *PAIR_SIZE).left != unseen.left[:64, :96]).mean() > 0.5

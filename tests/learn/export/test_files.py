@@ -11,7 +11,7 @@ from stereoweave.learn.export import int8 as quantise
 from stereoweave.matching.matcher import model_file
 
 
-def test_variants_are_made_of_a_shipped_network(tmp_path, monkeypatch, capsys):
+def test_variants_are_made_from_a_shipped_network(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(halve, "_PROOF_PAIRS", 1)
     monkeypatch.chdir(tmp_path)
     assert cli.main(["export", "small", "-o", "any.onnx"]) == 0
@@ -35,13 +35,16 @@ def test_variants_are_made_of_a_shipped_network(tmp_path, monkeypatch, capsys):
         ("export small -o out.trt", "out.trt: expected a name that ends in .onnx"),
         ("export small -o a.onnx --half a.onnx", "a.onnx: expected a different file"),
         ("export small -o a.onnx --size 640", "such as 640x480, found '640'"),
-        ("export small -o a.onnx --size 641x480", "expected multiples of 16 of at least 32, found 641x480"),
+        (
+            "export small -o a.onnx --size 641x480",
+            "expected multiples of 16 that are at least 32, found 641x480",
+        ),
         ("export none.onnx -o a.onnx", "none.onnx: expected an ONNX matcher file, found no such file"),
         ("export none -o a.onnx", "none"),
         ("export small -o a.onnx --half folder.onnx", "folder.onnx: expected a file that can be written"),
     ],
 )
-def test_what_cannot_be_made_is_told_in_one_line(tmp_path, monkeypatch, capsys, arguments, told):
+def test_an_impossible_export_is_reported_in_one_line(tmp_path, monkeypatch, capsys, arguments, told):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "folder.onnx").mkdir()
     assert cli.main(arguments.split()) == 2
@@ -50,7 +53,7 @@ def test_what_cannot_be_made_is_told_in_one_line(tmp_path, monkeypatch, capsys, 
     assert [file.name for file in tmp_path.iterdir()] == ["folder.onnx"]
 
 
-def test_8_bits_are_asked_for_in_the_same_way(tmp_path, monkeypatch):
+def test_an_8_bit_file_is_requested_in_the_same_way(tmp_path, monkeypatch):
     taken = []
     monkeypatch.setattr(
         matcher_files,
@@ -65,7 +68,7 @@ def test_8_bits_are_asked_for_in_the_same_way(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("option", ["-o", "--half", "--eight-bits"])
-def test_nothing_takes_the_place_of_the_file_that_it_is_made_from(tmp_path, monkeypatch, capsys, option):
+def test_an_export_does_not_overwrite_its_source(tmp_path, monkeypatch, capsys, option):
     monkeypatch.chdir(tmp_path)
     shutil.copyfile(model_file("small"), "mine.onnx")
     assert cli.main(["export", "mine.onnx", option, str(tmp_path / "mine.onnx")]) == 2

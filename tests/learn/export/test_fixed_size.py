@@ -26,13 +26,13 @@ def run(file, views):
     return session.run(None, views)
 
 
-def test_a_file_for_one_size_says_what_the_file_for_any_says(fixed, rng):
+def test_a_file_for_one_size_computes_the_same_as_the_file_for_any_size(fixed, rng):
     views = {side: rng.random((1, 3, 64, 96), np.float32) for side in ("left", "right")}
     for found, expected in zip(run(fixed, views), run(SMALL, views), strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-4)
 
 
-def test_every_shape_in_it_is_a_number_and_nothing_computes_shapes(fixed):
+def test_every_shape_in_the_file_is_constant_and_no_operator_computes_one(fixed):
     graph = onnx.load(fixed)
     assert {node.op_type for node in graph.graph.node} & set(fixed_size.SHAPES_BY_VALUE) == set()
     inferred = onnx.shape_inference.infer_shapes(graph, strict_mode=True).graph
@@ -46,7 +46,7 @@ def test_every_shape_in_it_is_a_number_and_nothing_computes_shapes(fixed):
     assert card == json.loads(SMALL.with_suffix(".json").read_text()) | {"size": [96, 64]}
 
 
-def test_a_matcher_pads_smaller_pictures_to_it(fixed, rng):
+def test_a_matcher_pads_smaller_pictures_to_the_fixed_size(fixed, rng):
     left, right = rng.integers(0, 255, (2, 60, 90, 3), np.uint8)
     assert Matcher(fixed).fixed_size == (64, 96)
     assert Matcher(fixed).estimate(left, right).disparity_px.shape == (60, 90)
@@ -57,11 +57,12 @@ def test_a_matcher_pads_smaller_pictures_to_it(fixed, rng):
 )
 def test_a_size_that_the_network_cannot_take_is_refused(tmp_path, width, height, suggested):
     message = complaint(fixed_size.fix_size, SMALL, tmp_path / "out.onnx", width, height)
-    assert message.startswith(f"size: expected multiples of 16 of at least 32, found {width}x{height}; ")
+    expected = "size: expected multiples of 16 that are at least 32"
+    assert message.startswith(f"{expected}, found {width}x{height}; ")
     assert suggested in message
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_file_for_one_size_gives_none_for_another(fixed, tmp_path):
+def test_a_file_for_one_size_cannot_be_converted_to_another_size(fixed, tmp_path):
     message = complaint(fixed_size.fix_size, fixed, tmp_path / "out.onnx", 128, 64)
     assert message.endswith("found one for 96x64 only; use the file that it was made from")

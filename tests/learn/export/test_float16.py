@@ -22,7 +22,7 @@ def small_pairs(monkeypatch):
 
 
 def a_graph_that_reads_a_disparity():
-    """A convolution by 1.0001, which is 1 in 16 bits, and 192 times its result, less 0.03."""
+    """Return a graph that convolves with 1.0001 (1 in 16 bits), multiplies by 192 and subtracts 0.03."""
     nodes = [
         helper.make_node("Conv", ["image", "weight"], ["a"], "conv"),
         helper.make_node("Relu", ["a"], ["b"], "relu"),
@@ -43,11 +43,11 @@ def test_convolutions_compute_in_16_bits_and_disparities_in_32():
     assert [node.op_type for node in made.graph.node] == ["Cast", "Conv", "Relu", "Cast", "Mul", "Sub"]
     session = onnxruntime.InferenceSession(made.SerializeToString(), providers=["CPUExecutionProvider"])
     (found,) = session.run(None, {"image": np.array([[[[0.5, 1.0]]]], np.float32)})
-    # 16 bits know 1/8 px at 192: these would be 95.9375 and 192.
+    # At 192 px 16 bits resolve 1/8 px: they would give 95.9375 and 192.
     np.testing.assert_allclose(found[0, 0, 0], [95.97, 191.97], atol=1e-4)
 
 
-def test_a_file_of_half_the_size_answers_nearly_alike_and_says_what_it_changed(small_pairs, tmp_path):
+def test_a_float16_file_is_half_as_large_and_its_card_has_the_small_difference(small_pairs, tmp_path):
     out = tmp_path / "weights" / "small16.onnx"
     card = halve.convert_to_float16(SMALL, out)
     assert out.stat().st_size < 0.55 * SMALL.stat().st_size
@@ -60,12 +60,12 @@ def test_a_file_of_half_the_size_answers_nearly_alike_and_says_what_it_changed(s
     assert 0 < card["differs_px_from_32_bits"] < 0.02
     assert card["parameters"] == json.loads(SMALL.with_suffix(".json").read_text())["parameters"]
 
-    # Neither is what a variant is made from.
+    # A variant cannot be the source of another one.
     message = complaint(halve.convert_to_float16, out, tmp_path / "again.onnx")
     assert message.endswith("found one in 16 bits; use the file that it was made from")
 
 
-def test_convolutions_and_products_alone_have_weights_of_16_bits():
+def test_only_convolutions_and_products_have_weights_of_16_bits():
     graph = onnx.load(SMALL)
     made = halve.cast_to_float16(graph, halve.select_float16_nodes(graph)).graph
     of_32_bits = {x.name for x in made.initializer if x.data_type == TensorProto.FLOAT}
@@ -74,8 +74,9 @@ def test_convolutions_and_products_alone_have_weights_of_16_bits():
     assert [x.type.tensor_type.elem_type for x in (*made.input, *made.output)] == [TensorProto.FLOAT] * 5
 
 
-def test_nothing_is_written_where_16_bits_change_too_much(small_pairs, tmp_path, monkeypatch):
+def test_nothing_is_written_if_16_bits_change_disparity_too_much(small_pairs, tmp_path, monkeypatch):
     monkeypatch.setattr(halve, "LARGEST_MEAN_DIFFERENCE_PX", 0.0)
     message = complaint(halve.convert_to_float16, SMALL, tmp_path / "small16.onnx")
-    assert "px on average, expected under 0.0; nothing was written" in message
+    assert "expected 16 bits to change disparity by less than 0.0 px on average, found 0.0" in message
+    assert message.endswith(" px; nothing was written")
     assert list(tmp_path.iterdir()) == []

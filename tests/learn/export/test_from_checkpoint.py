@@ -33,7 +33,7 @@ def little_calibration(monkeypatch):
 
 @pytest.fixture
 def run(tmp_path):
-    """The folder of a run that has learnt one pair."""
+    """Return the folder of a run that has overfitted one pair."""
     folder = tmp_path / "run"
     folder.mkdir()
     checkpoint.save(checkpoint_of(overfitted().network), folder / "last.pt")
@@ -47,7 +47,7 @@ def pair():
 
 
 def of_another_network(graph):
-    """The graph with the weights of one of its layers the other way round."""
+    """Return the graph with negated weights in one of its layers."""
     weights = next(value for value in graph.graph.initializer if len(value.dims) == 4)
     weights.CopyFrom(onnx.numpy_helper.from_array(-onnx.numpy_helper.to_array(weights), weights.name))
     return graph
@@ -96,7 +96,7 @@ def test_the_matcher_file_answers_as_pytorch_does_and_nothing_is_written_otherwi
     found_px = matcher.estimate(pair.left, pair.right).disparity_px
     assert abs(found_px - overfitted().sample.disparity_px).mean() < 1
 
-    # Here, because the exporter takes its time.
+    # In the same test, because the export is slow.
     monkeypatch.setattr(export, "export_graph", lambda _network, _kept: of_another_network(graph))
     elsewhere = tmp_path / "elsewhere" / "tiny.onnx"
     with pytest.raises(
@@ -108,7 +108,7 @@ def test_the_matcher_file_answers_as_pytorch_does_and_nothing_is_written_otherwi
 
 @pytest.fixture
 def paper_run(tmp_path):
-    """The folder of a run of the paper's network, whose weights spread its codes over 0..1."""
+    """Return the folder of a run of the paper's network, with weights that spread its codes over 0..1."""
     network = untrained("fast_depth")
     torch.nn.init.normal_(network.head.to_code.weight, std=0.05)
     recipe = recipe_of("fast_depth", exponent=1.5, alpha_p=1.0)
@@ -117,7 +117,7 @@ def paper_run(tmp_path):
     return tmp_path / "paper"
 
 
-def test_the_papers_network_becomes_a_matcher_that_finds_the_right_view_by_the_mirrored_pair(
+def test_a_matcher_of_the_papers_network_estimates_the_right_view_from_the_mirrored_pair(
     paper_run, pair, tmp_path
 ):
     out = tmp_path / "paper.onnx"
@@ -138,12 +138,12 @@ def test_the_papers_network_becomes_a_matcher_that_finds_the_right_view_by_the_m
         tensors = [torch.from_numpy(image).permute(2, 0, 1)[None] / 255 for image in (view.left, view.right)]
         with torch.no_grad():
             code = network.network(*tensors)[0, 0].numpy()
-        # Equation (4), of a range of 48 px.
+        # Equation (4) with a range of 48 px.
         np.testing.assert_allclose(values, 48 * code ** (1 / 1.5), atol=0.01)
     assert np.ptp(found.disparity_px) > 1
 
 
-def test_a_network_that_predicts_pixels_gives_a_matcher_its_pixels():
+def test_a_matcher_returns_the_pixels_that_its_network_predicts():
     network, recipe = untrained("psmnet"), recipe_of("psmnet", exponent=2.0)
     left, right = torch.rand(2, 1, 3, 32, 48)
     matcher = export.DisparityNetwork(network, recipe)
@@ -153,12 +153,12 @@ def test_a_network_that_predicts_pixels_gives_a_matcher_its_pixels():
     assert (matcher.multiple_of, matcher.max_disparity_px) == (16, 48)
 
 
-def test_a_network_of_depth_is_no_matcher(tmp_path):
+def test_a_network_that_estimates_depth_cannot_be_exported(tmp_path):
     recipe = recipe_of("fast_depth", target="depth")
     checkpoint.save(checkpoint_of(untrained("fast_depth"), recipe), tmp_path / "last.pt")
     assert complaint(export.export_matcher, tmp_path, tmp_path / "out" / "depth.onnx") == (
-        "tiny: a matcher file gives disparity, expected target = 'disparity', found 'depth'; "
-        "the network needs each pair's camera"
+        "tiny: expected target = 'disparity', found 'depth'; "
+        "a matcher file has no camera to convert depth to disparity"
     )
     assert not (tmp_path / "out").exists()
 
@@ -183,6 +183,6 @@ def test_multiply_adds_count_the_refinement_of_weavenet():
     network, image = untrained("weave_base"), torch.rand(1, 3, 16, 32)
     with FlopCounterMode(display=False) as counter, torch.no_grad():
         network(image, image)
-    # Both views at half the resolution compare 16 features with those of 6 columns.
+    # At half the resolution, both views compare 16 features with those of 6 columns.
     refinement = 2 * 8 * 16 * 16 * 6
     assert export.count_multiply_adds(network, 16, 32) == counter.get_total_flops() // 2 + refinement

@@ -19,7 +19,7 @@ def small_pairs(monkeypatch):
     monkeypatch.setattr(quantise, "_SIZE", PAIR_SIZE)
     monkeypatch.setattr(quantise, "_RANGES_PAIRS", 2)
     monkeypatch.setattr(quantise, "_PROOF_PAIRS", 2)
-    # Pictures this small leave more to chance than the network's own size.
+    # The loss varies more on pictures this small than at the network's own size.
     monkeypatch.setattr(quantise, "LARGEST_LOSS_PX", 1.0)
 
 
@@ -31,7 +31,7 @@ def node(operation, read, given):
     return helper.make_node(operation, read, [given], f"{operation}_{given}")
 
 
-def test_convolutions_and_what_stands_between_them_alone_take_8_bits():
+def test_only_convolutions_and_nodes_between_them_take_8_bits():
     nodes = [
         conv("image", "encoder.weight", "a"),
         node("Relu", ["a"], "b"),
@@ -39,9 +39,9 @@ def test_convolutions_and_what_stands_between_them_alone_take_8_bits():
         node("Add", ["b", "c"], "d"),
         node("Concat", ["d", "b"], "e"),
         conv("e", "scores.weight", "f"),
-        node("Relu", ["f"], "g"),  # of a convolution, though others read it
-        node("Add", ["g", "image"], "h"),  # read by no convolution
-        node("Concat", ["h", "g"], "i"),  # by one that keeps float32
+        node("Relu", ["f"], "g"),  # follows a convolution, though other nodes read it
+        node("Add", ["g", "image"], "h"),  # no convolution reads it
+        node("Concat", ["h", "g"], "i"),  # read by a convolution that stays in float32
         conv("i", "refinement.join.weight", "j"),
     ]
     image = helper.make_tensor_value_info("image", TensorProto.FLOAT, None)
@@ -52,7 +52,7 @@ def test_convolutions_and_what_stands_between_them_alone_take_8_bits():
     ]  # fmt: skip
 
 
-def test_a_smaller_file_answers_nearly_alike_and_says_what_it_lost(small_pairs, tmp_path):
+def test_an_8_bit_file_is_smaller_and_its_card_has_the_small_loss(small_pairs, tmp_path):
     out = tmp_path / "weights" / "small8.onnx"
     card = quantise.quantise(SMALL, out)
     assert out.stat().st_size < SMALL.stat().st_size / 2
@@ -79,8 +79,9 @@ def test_only_the_refinement_keeps_weights_of_32_bits(small_pairs, tmp_path):
     assert all(name.startswith("refinement.") for name in kept)
 
 
-def test_nothing_is_written_where_8_bits_lose_too_much(small_pairs, tmp_path, monkeypatch):
+def test_nothing_is_written_if_8_bits_lose_too_much(small_pairs, tmp_path, monkeypatch):
     monkeypatch.setattr(quantise, "LARGEST_LOSS_PX", -10.0)
     message = complaint(quantise.quantise, SMALL, tmp_path / "small8.onnx")
-    assert "expected under -10.0; nothing was written" in message
+    assert "expected 8 bits to increase the mean error by less than -10.0 px, found " in message
+    assert message.endswith(" px; nothing was written")
     assert list(tmp_path.iterdir()) == []

@@ -1,4 +1,4 @@
-"""The table of runtimes: kept true, by making again what runs here of the small network."""
+"""The table of runtimes is checked by measuring the small network again on the runtimes of this machine."""
 
 import csv
 from dataclasses import fields
@@ -18,10 +18,10 @@ from stereoweave.matching.matcher import model_file
 from stereoweave.matching.providers import open_session
 
 ROOT = Path(__file__).parents[3]
-# Beside other tests two threads wait for one another most of the time, and busily.
+# When other tests run at the same time, two threads spend most of their time waiting for each other.
 torch.set_num_threads(1)
-# One pair stands for the table's twelve, of which some are harder than others, and processors with other
-# vector instructions round otherwise.
+# The tests use one pair instead of the table's twelve, which differ in difficulty, and processors with other
+# vector instructions round differently.
 MARGIN = 3
 
 
@@ -48,7 +48,7 @@ def test_the_table_has_every_variant_of_every_network():
     assert found == [(network, variant) for network in ("small", "base") for variant in variants]
 
 
-def test_float32_and_its_batches_are_pytorchs_to_rounding_and_16_bits_to_a_fiftieth_of_a_pixel():
+def test_float32_differs_from_pytorch_only_by_rounding_and_float16_by_less_than_a_fiftieth_of_a_pixel():
     for row in ROWS:
         if row.provider == "cpu" and row.variant != "8-bit":
             most_px = 0.02 if row.variant == "fp16" else 0.0005
@@ -57,7 +57,7 @@ def test_float32_and_its_batches_are_pytorchs_to_rounding_and_16_bits_to_a_fifti
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory):
-    """The small network in PyTorch, and the variants of its file, proved on one pair each; 8 bits of two."""
+    """Return the small network in PyTorch, and the variants of its file, made with few pairs."""
     file = model_file("small")
     kept = checkpoint.load(ROOT / "checkpoints/small.pt")
     with pytest.MonkeyPatch.context() as patch:
@@ -68,7 +68,7 @@ def small(tmp_path_factory):
     return parity.apply_shipped_calibration(load_matcher_network(kept), file), made
 
 
-def test_what_runs_here_differs_from_pytorch_by_no_more_than_the_table_says(small):
+def test_variants_on_this_machine_differ_from_pytorch_by_no_more_than_the_table_says(small):
     network, made = small
     views = {size: parity.paint_pairs(size, 1) for size in ((240, 320), (480, 640))}
     expected = {size: parity.run_in_pytorch(network, x) for size, x in views.items()}
@@ -79,7 +79,7 @@ def test_what_runs_here_differs_from_pytorch_by_no_more_than_the_table_says(smal
         session = open_session(variant.file, row.provider, 1)
         found = {size: parity.run_in_onnx_runtime(session, variant.batch, views[size])}
         for name, value in parity.summarise_differences(expected, found).items():
-            # What is nearly equal differs by rounding, and rounding between machines.
+            # Nearly equal values differ by rounding, which depends on the machine.
             assert value <= MARGIN * getattr(row, name) + 1e-4, (row.variant, row.provider, name)
         assert variant.file.stat().st_size / 1e6 == pytest.approx(row.file_mb, rel=0.02)
     assert {row.variant for row in here} == set(made)
@@ -121,6 +121,6 @@ def test_the_command_writes_and_shows_a_row_for_each_variant(tmp_path, monkeypat
     assert 0 < here[0].left_max_px < 0.01
 
 
-def test_a_network_that_does_not_ship_has_no_file_to_compare(capsys):
+def test_a_network_that_is_not_shipped_has_no_file_to_compare(capsys):
     assert cli.main(["bench", "parity", str(ROOT / "checkpoints/fast_depth.pt")]) == 2
     assert "expected base or small" in capsys.readouterr().err
