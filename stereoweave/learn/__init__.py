@@ -1,1 +1,1 @@
-"""Networks and their training; the only package that needs PyTorch."""
+"""Networks and their training; the only subpackage that needs PyTorch."""

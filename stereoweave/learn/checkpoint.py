@@ -1,4 +1,4 @@
-"""Checkpoints: the complete state of a run, from which an interrupted run resumes exactly."""
+"""Checkpoints: the complete state of a run, enough to resume it exactly after an interruption."""
 
 import os
 import subprocess
@@ -21,13 +21,13 @@ class Checkpoint:
 
     Attributes:
         weights: The network's current weights.
-        averaged: Running average of the weights; scored and exported.
-        optimiser: The optimiser's state; empty in a checkpoint that only starts other runs.
+        averaged: Running average of the weights, which is scored and exported.
+        optimiser: The optimiser's state; empty in a checkpoint that only serves to start other runs.
         random_state: PyTorch's random state. Every other draw depends on (seed, step) alone.
         scores: Scores of the last validation.
-        commit: Commit of the code that trained.
-        hours: Training time so far, over all restarts and the run it started from.
-        origin: Recipe, step and commit of each checkpoint the run descends from, oldest first.
+        commit: Commit of the code that trained the network.
+        hours: Training time so far, including restarts and the runs that this one descends from.
+        origin: Recipe, step and commit of each checkpoint that the run descends from, oldest first.
     """
 
     recipe: Recipe
@@ -42,14 +42,14 @@ class Checkpoint:
     origin: tuple[dict[str, Any], ...] = ()
 
     def as_origin(self) -> tuple[dict[str, Any], ...]:
-        """The origin of a run that starts from this checkpoint."""
+        """Return the origin of a run that starts from this checkpoint."""
         return *self.origin, {"recipe": asdict(self.recipe), "step": self.step, "commit": self.commit}
 
 
 def make_initial(recipe: Recipe, commit: str) -> Checkpoint:
-    """Make the checkpoint of a new run.
+    """Make the first checkpoint of a new run.
 
-    Its weights are the averaged ones of the recipe's `start_from` where name and shape match, else random.
+    Weights take the averaged values of `start_from` where name and shape match; all others are random.
 
     Raises:
         FormatError: `start_from` is not a checkpoint, or shares no weights with the network.
@@ -76,9 +76,9 @@ def make_initial(recipe: Recipe, commit: str) -> Checkpoint:
 
 
 def _take_weights(fresh: Weights, earlier: Checkpoint, recipe: Recipe) -> Weights:
-    """The earlier run's averaged weights where name and shape match, else the fresh ones."""
+    """Return the earlier run's averaged weights where name and shape match, else the fresh ones."""
     taken = {
-        name: value.to(fresh[name].dtype)  # may be in half precision
+        name: value.to(fresh[name].dtype)  # a stripped checkpoint is in half precision
         for name, value in earlier.averaged.items()
         if name in fresh and value.shape == fresh[name].shape
     }
@@ -91,7 +91,7 @@ def _take_weights(fresh: Weights, earlier: Checkpoint, recipe: Recipe) -> Weight
 
 
 def strip_to_average(kept: Checkpoint) -> Checkpoint:
-    """Strip a checkpoint to its averaged weights in half precision, for other runs to start from."""
+    """Reduce a checkpoint to its averaged weights in half precision, from which other runs can start."""
     weights = {
         name: value.half() if value.is_floating_point() else value for name, value in kept.averaged.items()
     }
@@ -99,19 +99,19 @@ def strip_to_average(kept: Checkpoint) -> Checkpoint:
 
 
 def average(first: Checkpoint, second: Checkpoint, start: Checkpoint) -> Checkpoint:
-    """Average two runs that both continued from `start`, as the start of a further run.
+    """Average two runs that both started from `start`, to start a further run from the result.
 
     The mean of two networks fine-tuned from the same weights is often better than either (Wortsman et al.,
     "Model soups", ICML 2022). Running variances are averaged too.
 
     Raises:
-        FormatError: One of the two did not continue from `start`.
+        FormatError: One of the two runs did not start from `start`.
     """
     for run in (first, second):
         if _list_origins(run.origin) != _list_origins(start.as_origin()):
             raise FormatError(
                 f"{run.recipe.name}: expected a run that started from {start.recipe.name} after {start.step} "
-                "steps, found one that did not"
+                "steps, found one with a different origin"
             )
     weights = {name: _midpoint(value, second.averaged[name]) for name, value in first.averaged.items()}
     return replace(
@@ -126,12 +126,12 @@ def average(first: Checkpoint, second: Checkpoint, start: Checkpoint) -> Checkpo
 
 
 def _list_origins(origin: tuple[dict[str, Any], ...]) -> list[tuple[str, int]]:
-    # Without the recipes: old ones lack keys that were added later.
+    # Recipes are not compared, because old ones lack keys that were added later.
     return [(past["commit"], past["step"]) for past in origin]
 
 
 def _midpoint(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
-    # Batch counts of batch norms are integers.
+    # The batch counters of batch norms are integers and cannot be averaged.
     return (first + second) / 2 if first.is_floating_point() else first
 
 
@@ -147,12 +147,12 @@ def save(checkpoint: Checkpoint, path: Path) -> None:
 
 
 def load(path: Path) -> Checkpoint:
-    """Load a checkpoint to the CPU. Raises FormatError if the file is missing or not a checkpoint."""
+    """Load a checkpoint onto the CPU. Raises FormatError if the file is missing or not a checkpoint."""
     try:
         values = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError as error:
         raise FormatError(
-            f"{path}: no such checkpoint; `stereoweave train` writes last.pt into its run"
+            f"{path}: no such checkpoint; `stereoweave train` writes last.pt into the run's folder"
         ) from error
     except Exception as error:  # PyTorch's reader raises any type of error on invalid bytes
         raise FormatError(
@@ -161,15 +161,15 @@ def load(path: Path) -> Checkpoint:
     # Older checkpoints have no origin.
     if not isinstance(values, dict) or {*values, "origin"} != {field.name for field in fields(Checkpoint)}:
         raise FormatError(
-            f"{path}: expected a checkpoint of `stereoweave train`, found something else that PyTorch saved"
+            f"{path}: expected a checkpoint of `stereoweave train`, found another kind of PyTorch file"
         )
     return Checkpoint(**{**values, "recipe": parse_recipe(values["recipe"], str(path))})
 
 
 def find_commit() -> str:
-    """Commit of the running code, followed by '+' if files were changed; 'unknown' outside git."""
+    """Return the commit of the running code, with a '+' if files were changed; 'unknown' outside git."""
     try:
-        # Only this package's repository: an installed package may lie inside an unrelated one.
+        # Only in this package's own repository: an installed package may lie inside an unrelated one.
         described = subprocess.run(
             ["git", "--git-dir=.git", "describe", "--always", "--dirty=+", "--exclude=*"],
             cwd=Path(__file__).parents[2], capture_output=True, text=True, check=True,

@@ -1,4 +1,4 @@
-"""The processes that train one network together: the ranks that torchrun started, or this process alone."""
+"""Distributed training of one network by the ranks that torchrun started, or by this process alone."""
 
 import os
 import time
@@ -9,26 +9,26 @@ from dataclasses import dataclass
 from stereoweave.errors import StereoweaveError
 from stereoweave.system.threads import usable_cores
 
-# Delay of a secondary error: time for the rank that failed first to exit, upon which torchrun ends all ranks.
+# Delay of errors that another rank's failure may have caused: once that rank exits, torchrun ends the others.
 _PATIENCE_S = 20.0
 
 
 @dataclass(frozen=True)
 class ProcessRank:
-    """This process's rank, and the number of ranks in all and on this machine."""
+    """Rank of this process, and the number of ranks in total and on this machine."""
 
     rank: int = 0
     world_size: int = 1
     local_world_size: int = 1
 
     def own_micro_batches(self, count: int) -> range:
-        """Indices of this rank's micro-batches among the `count` of a step; ranks do not overlap."""
+        """Return this rank's share of a step's `count` micro-batches as indices; ranks do not overlap."""
         own = count // self.world_size
         return range(self.rank * own, (self.rank + 1) * own)
 
 
 def read_rank() -> ProcessRank:
-    """Read the rank that torchrun gave this process. Without torchrun: rank 0 of 1."""
+    """Read the rank that torchrun assigned to this process; without torchrun, it is rank 0 of 1."""
     if "TORCHELASTIC_RUN_ID" not in os.environ:
         return ProcessRank()
     return ProcessRank(*(int(os.environ[name]) for name in ("RANK", "WORLD_SIZE", "LOCAL_WORLD_SIZE")))
@@ -36,10 +36,10 @@ def read_rank() -> ProcessRank:
 
 @contextmanager
 def report_once() -> Iterator[None]:
-    """Report an error once: from rank 0 if it occurs in every rank.
+    """Report an error only once, from rank 0 if it occurs in every rank.
 
-    Errors of the other ranks, and connection errors of rank 0, leave the block 20 s later. By then torchrun
-    has usually ended the process because of the rank that failed first.
+    The other ranks, and rank 0 after a connection error, wait for 20 s before the error leaves the block. By
+    then torchrun has usually ended them, because another rank failed first.
     """
     try:
         yield
@@ -52,10 +52,10 @@ def report_once() -> Iterator[None]:
 
 
 def choose_thread_count() -> int | None:
-    """Threads for this process: an equal share of the machine's cores; None to keep PyTorch's choice.
+    """Return this process's equal share of the cores as its number of threads; None for PyTorch's default.
 
-    None in a single process, and where OMP_NUM_THREADS is above 1. A value of 1 is what torchrun sets by
-    default, however many cores there are, so it does not count as a choice.
+    The result is None in a single process, and if OMP_NUM_THREADS is above 1. A value of 1 does not count as
+    the user's choice, because torchrun sets it by default on any machine.
     """
     here = read_rank().local_world_size
     if here == 1 or os.environ.get("OMP_NUM_THREADS", "1") != "1":

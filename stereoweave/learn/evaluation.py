@@ -20,20 +20,20 @@ from stereoweave.learn.training.objective import CodeObjective
 from stereoweave.stereo import Sample
 
 MEDIAN = "median"
-# The median is taken over this many pairs, and every 8th row and column.
+# The median is taken over about 400 pairs, in every 8th row and column.
 _MEDIAN_PAIRS, _MEDIAN_STRIDE = 400, 8
 
 
 def evaluate(runs: Sequence[Path], folder: Path, console: Console) -> list[ProjectionRow]:
-    """Score each run on all its held-out pairs, after ground truth, no warping, SGBM and the median.
+    """Score each run on all its held-out pairs, and baselines on the same pairs.
 
-    "median" predicts the median disparity of the training pairs everywhere: the score of a network that
-    ignores the images.
+    The baselines come first: ground truth, no warping, SGBM and "median". The last one predicts the median
+    disparity of the training pairs everywhere, so it scores like a network that ignores the images.
 
     Args:
         runs: Run folders of `stereoweave train`, or checkpoints, all with the same held-out pairs.
         folder: Cache folder of collage pairs; missing pairs are made.
-        console: Shows the progress of making pairs.
+        console: Console that shows progress while pairs are made.
 
     Raises:
         StereoweaveError: The runs have different held-out pairs, or two rows would have the same name.
@@ -72,7 +72,7 @@ def make_method(trained: Checkpoint) -> DisparityMethod:
 
 
 def make_median_method(training: PairSource) -> DisparityMethod:
-    """A method that predicts the median disparity of the training pairs for every pixel."""
+    """Return a method that predicts the median disparity of the training pairs at every pixel."""
     some = range(0, training.count, max(1, training.count // _MEDIAN_PAIRS))
     values_px = [
         read_known(training, i).disparity_px[::_MEDIAN_STRIDE, ::_MEDIAN_STRIDE].ravel() for i in some
@@ -85,23 +85,23 @@ def _check_names(names: Sequence[str]) -> None:
     rows = [MEDIAN, *names]
     if twice := [name for name in names if rows.count(name) > 1]:
         raise StereoweaveError(
-            f"{twice[0]}: expected run folders of different names, none of them {MEDIAN!r}; rename it"
+            f"{twice[0]}: expected a unique name of a run other than {MEDIAN!r}; rename it"
         )
 
 
 def _find_common_recipe(networks: dict[str, Checkpoint]) -> Recipe:
-    """The first run's recipe. Raises StereoweaveError if another run has other held-out pairs."""
+    """Return the first run's recipe. Raises StereoweaveError if another run has different held-out pairs."""
     pairs = {name: identify_held_out(one.recipe) for name, one in networks.items()}
     first, *others = pairs
     for name in others:
         if pairs[name] != pairs[first]:
             raise StereoweaveError(
-                f"{name}: expected the pairs of {first}, {pairs[first]}, found {pairs[name]}; "
+                f"{name}: expected the held-out pairs of {first}, {pairs[first]}, found {pairs[name]}; "
                 "score it separately"
             )
     return networks[first].recipe
 
 
 def identify_held_out(recipe: Recipe) -> tuple[object, ...]:
-    """The settings that determine a recipe's held-out pairs; equal where the pairs are the same."""
+    """Return the settings that determine a recipe's held-out pairs; equal settings give equal pairs."""
     return recipe.dataset, recipe.root, recipe.split, recipe.pair_size, recipe.validation_pairs

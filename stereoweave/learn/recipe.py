@@ -11,29 +11,30 @@ from pydantic import BeforeValidator, ConfigDict, Field, TypeAdapter, Validation
 from stereoweave.errors import FormatError
 from stereoweave.io.files import read_small, reading
 
-# Characters. The longest shipped recipe has 1,064; tomllib takes quadratic time for a key with many dots.
+# Characters of a recipe. The longest shipped one has 1,064. For a key with many dots, tomllib takes quadratic
+# time.
 _LONGEST = 10_000
-# Characters of a value in an error.
+# Characters of a value that an error quotes.
 _LONGEST_VALUE = 100
-# TOML's range of whole numbers; tomllib reads larger ones too.
+# TOML limits whole numbers to 64 bits, but tomllib also reads larger ones.
 _MOST = 2**63 - 1
 COLLAGE = "collage"
 
 
 def _as_pairs(table: object) -> object:
-    """Items of a TOML table; recipes and checkpoints hold tables as pairs, which are hashable."""
+    """Return a TOML table as a tuple of pairs, which is hashable; return any other value unchanged."""
     return tuple(table.items()) if isinstance(table, dict) else table
 
 
-# Errors quote the description as what was expected.
-Text = Annotated[str, Field(strict=True, description="a text in quotes")]
+# Errors quote these descriptions after "expected".
+Text = Annotated[str, Field(strict=True, description="text in quotes")]
 Switch = Annotated[bool, Field(strict=True, description="true or false")]
 Target = Annotated[Literal["disparity", "depth"], Field(description="'disparity' or 'depth'")]
 Whole = Annotated[
-    int, Field(strict=True, ge=-_MOST, le=_MOST, description="a whole number of at most 64 bits")
+    int, Field(strict=True, ge=-_MOST, le=_MOST, description="a whole number that fits in 64 bits")
 ]
-CountOrZero = Annotated[Whole, Field(ge=0, description="a whole number of at least 0 and at most 64 bits")]
-Count = Annotated[Whole, Field(ge=1, description="a whole number of at least 1 and at most 64 bits")]
+CountOrZero = Annotated[Whole, Field(ge=0, description="a whole number of at least 0 that fits in 64 bits")]
+Count = Annotated[Whole, Field(ge=1, description="a whole number of at least 1 that fits in 64 bits")]
 Size = Annotated[tuple[Count, Count], Field(description="two whole numbers of at least 1")]
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Positive = Annotated[Number, Field(gt=0, description="a number above 0")]
@@ -43,7 +44,7 @@ Share = Annotated[Number, Field(ge=0, le=1, description="a number from 0 to 1")]
 Weights = Annotated[
     tuple[tuple[Text, Positive], ...],
     BeforeValidator(_as_pairs),
-    Field(description="a table of sets and their weights above 0, such as collage = 0.5"),
+    Field(description="a table of sets with weights above 0, such as collage = 0.5"),
 ]
 Folders = Annotated[
     tuple[tuple[Text, Text], ...],
@@ -59,43 +60,44 @@ class Recipe:
     Attributes:
         name: Name of the run and of the network.
         model: Key of MODELS.
-        seed: Seed of the initial weights, the pairs and all random draws.
-        start_from: Checkpoint that initialises all weights of the same name and shape with its averaged
-            weights; the other weights are random. Empty: all are random.
-        steps: Optimiser steps in total.
+        seed: Seed of the initial weights, the pairs and all other random draws.
+        start_from: Checkpoint whose averaged weights initialise all weights of the same name and shape; the
+            other weights are random. If it is empty, all weights are random.
+        steps: Total number of optimiser steps.
         batch: Pairs per step.
-        micro_batch: Pairs per forward pass, over which batch norm takes its statistics; a step follows the
-            mean gradient of its micro-batches. 0: the whole batch.
-        learning_rate: Peak rate: the rate rises linearly in the warm-up and falls linearly in the cool-down.
-        warm_up_steps: First steps, with a rising learning rate.
-        cool_down_steps: Last steps, with a falling learning rate.
-        weight_decay: Weight decay of AdamW; 0: Adam.
-        averaged_steps: Length of the running average of the weights. Validation and export use the average.
-            A longer one lags behind, a shorter one keeps the noise of single batches; 1: no averaging.
+        micro_batch: Pairs per forward pass, over which batch norm takes its statistics; a step uses the mean
+            gradient of its micro-batches. 0 means the whole batch.
+        learning_rate: Peak learning rate, which follows a linear warm-up and precedes a linear cool-down.
+        warm_up_steps: Number of steps at the start in which the learning rate rises.
+        cool_down_steps: Number of steps at the end in which the learning rate falls.
+        weight_decay: Weight decay of AdamW; 0 selects Adam.
+        averaged_steps: Length of the running average of the weights, which validation and export use. A
+            longer average lags behind, a shorter one keeps the noise of single batches; 1 disables averaging.
         dataset: "collage" or a key of DATASETS.
         root: Folder of the unpacked dataset; empty for collage.
         mix: Training sets that replace the dataset, with their relative weights. A set is "collage" or a
-            folder of rendered pairs (data/shards.py). Validation keeps to the dataset.
-        split: Key of SPLITS (data/splits.py): how frames are divided into training and held-out ones.
-        pairs: Number of collage pairs to keep; every step crops them differently.
-        fresh: Paint a new collage for each draw, and keep none.
+            folder of rendered pairs (data/shards.py). Validation still uses the dataset.
+        split: Key of SPLITS (data/splits.py), which divides frames into training and held-out ones.
+        pairs: Number of collage pairs to cache; every step crops them differently.
+        fresh: Paint a new collage for each draw instead of caching pairs.
         pair_size: Height and width of a collage pair.
         crop_size: Height and width of the crops that a step trains on.
         augment: Also scale, mirror and recolour crops.
         offset_share: Share of pairs whose right crop is shifted to the right, which increases disparity.
         validation_pairs: Number of pairs to validate on: collages of another seed, or held-out frames.
-        held_out: Further sets to validate on, as pairs of name and folder of rendered pairs.
-        validate_every: Steps between validations; a checkpoint follows each.
-        loss: Key of LOSSES: "weave" for WeaveNet; the others compare codes, for all other networks.
+        held_out: Further validation sets, each with its name and its folder of rendered pairs.
+        validate_every: Steps between validations; a checkpoint is written after each.
+        loss: Key of LOSSES: "weave" for WeaveNet; for all other networks, a loss that compares codes.
         target: Quantity that a code encodes, "disparity" or "depth".
         max_disparity_px: Disparity of code 1; larger true disparities count as unknown.
         max_depth_m: Depth of code 0; a larger true depth is an error.
-        exponent: The paper's p.
-        fit_exponent: Fit p to the histogram of the training truth instead.
+        exponent: The paper's exponent p.
+        fit_exponent: Fit p to the histogram of the training pairs' ground truth instead.
         alpha_z: Weight of the loss between codes.
         alpha_p: Weight of the projection loss.
-        distribution: Weight of WeaveNet's cross-entropy between levels; 0: regression only.
-        robust: Share of the logarithm in WeaveNet's regression loss, which weakens large errors.
+        distribution: Weight of WeaveNet's cross-entropy over disparity levels; 0 for regression only.
+        robust: Share of the logarithm in WeaveNet's regression loss, which reduces the effect of large
+            errors.
         vgg16_weights: File of VGG-16 weights for the perceptual loss.
     """
 
@@ -144,7 +146,7 @@ class Recipe:
         return self.batch // (self.micro_batch or self.batch)
 
     def learning_rate_at(self, step: int) -> float:
-        """Learning rate of a step; the first step is 0."""
+        """Return the learning rate of a step, counted from 0."""
         warm_up = (step + 1) / max(self.warm_up_steps, 1)
         cool_down = (self.steps - step) / max(self.cool_down_steps, 1)
         return self.learning_rate * min(warm_up, cool_down, 1.0)
@@ -157,7 +159,7 @@ def read_recipe(path: Path) -> Recipe:
     """Read a recipe from a TOML file.
 
     Raises:
-        FormatError: if the file is unreadable, or a key is unknown, missing, of a wrong type or out of range.
+        FormatError: The file is unreadable, or a key is unknown, missing, of the wrong type or out of range.
     """
     with reading(path, "a recipe in TOML"):
         text = read_small(path).decode()
@@ -168,10 +170,10 @@ def read_recipe(path: Path) -> Recipe:
 
 
 def parse_recipe(values: dict[str, Any], source: str) -> Recipe:
-    """Make a recipe from its values.
+    """Make a recipe from a dictionary of its values.
 
     Raises:
-        FormatError: if they are invalid; the message begins with `source`.
+        FormatError: The values are invalid; the message begins with `source`.
     """
     try:
         recipe = _RECIPES.validate_python(values)
@@ -183,7 +185,7 @@ def parse_recipe(values: dict[str, Any], source: str) -> Recipe:
 
 
 def _describe_mistake(error: ValidationError, values: dict[str, Any]) -> str:
-    """Describe one mistake in a line: an unknown key, else an invalid value, else a missing key."""
+    """Describe one mistake in a single line: an unknown key, else an invalid value, else a missing key."""
     known: dict[str, Any] = {field.name: field.type for field in fields(Recipe)}
     if unknown := sorted(values.keys() - known.keys()):
         return f"unknown key {unknown[0]!r}; a recipe has {', '.join(known)}"
@@ -197,7 +199,7 @@ def _describe_mistake(error: ValidationError, values: dict[str, Any]) -> str:
 
 
 def _find_contradiction(recipe: Recipe) -> str | None:
-    """Describe the first two settings that exclude each other, in one line; None if none do."""
+    """Describe the first contradiction between settings in one line, or return None."""
     collage = recipe.dataset == COLLAGE
     if recipe.batch % (recipe.micro_batch or recipe.batch):
         return f"micro_batch: expected a divisor of batch = {recipe.batch}, found {recipe.micro_batch}"
@@ -205,15 +207,15 @@ def _find_contradiction(recipe: Recipe) -> str | None:
         limit, found = list(recipe.pair_size), list(recipe.crop_size)
         return f"crop_size: expected at most pair_size = {limit}, found {found}"
     if recipe.mix and not collage:
-        return f"mix: expected dataset = {COLLAGE!r}, on which a mix is validated, found {recipe.dataset!r}"
+        return f"mix: expected dataset = {COLLAGE!r} to validate the mix on, found {recipe.dataset!r}"
     if collage == bool(recipe.root):
-        expected = "none for collage" if collage else "the dataset's folder"
+        expected = "no folder" if collage else "the dataset's folder"
         return f"root: expected {expected}, found {recipe.root!r} with dataset = {recipe.dataset!r}"
     return None
 
 
 def _shorten(value: object) -> str:
-    """Shortened repr of a value."""
+    """Return the repr of a value, shortened for an error message."""
     try:
         text = repr(value)
     except (ValueError, RecursionError):  # over 4,300 digits; deeply nested arrays

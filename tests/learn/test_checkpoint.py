@@ -14,7 +14,7 @@ from stereoweave.learn.training.perceptual import PerceptualLoss
 
 @pytest.fixture
 def trained():
-    """A checkpoint with all that a run leaves, of a network that is a single layer."""
+    """Return a complete checkpoint of a network that is a single layer."""
     torch.manual_seed(0)
     layer = nn.Conv2d(3, 4, 3).to(memory_format=torch.channels_last)
     optimiser = torch.optim.AdamW(layer.parameters(), 1e-3, fused=True)
@@ -59,7 +59,7 @@ def test_a_saved_checkpoint_leaves_no_other_file(tmp_path, trained):
     assert [file.name for file in tmp_path.iterdir()] == ["last.pt"]
 
 
-def test_a_checkpoint_from_before_there_was_an_origin_has_none(tmp_path, trained):
+def test_an_old_checkpoint_without_an_origin_loads_with_an_empty_one(tmp_path, trained):
     path = tmp_path / "old.pt"
     values = {**vars(trained), "recipe": asdict(RECIPE)}
     del values["origin"]
@@ -93,7 +93,7 @@ def of_another_recipe_version(path, trained):
     ],
     ids=["bytes", "empty", "text", "word", "folder", "list", "weights", "module", "truncated", "recipe"],
 )
-def test_a_file_that_is_no_checkpoint_is_named_in_one_line(tmp_path, trained, write):
+def test_an_error_names_a_file_that_is_not_a_checkpoint_in_one_line(tmp_path, trained, write):
     path = tmp_path / "no.pt"
     write(path, trained)
     with pytest.raises(FormatError) as caught:
@@ -103,7 +103,7 @@ def test_a_file_that_is_no_checkpoint_is_named_in_one_line(tmp_path, trained, wr
 
 
 class Program:
-    """What calls a program when it is unpickled."""
+    """An object that runs a program when it is unpickled."""
 
     def __init__(self, words):
         self.words = words
@@ -129,7 +129,7 @@ def test_a_checkpoint_that_holds_a_program_is_refused_in_one_line_and_the_progra
     assert not made.exists()
 
 
-def test_a_checkpoint_that_is_not_there_is_named_with_what_makes_one(tmp_path):
+def test_an_error_about_a_missing_checkpoint_names_the_command_that_writes_one(tmp_path):
     with pytest.raises(FormatError, match=r"nowhere\.pt: no such checkpoint; `stereoweave train`"):
         checkpoint.load(tmp_path / "nowhere.pt")
 
@@ -138,7 +138,7 @@ def test_the_commit_of_the_code_is_a_short_hash_or_unknown():
     assert re.fullmatch(r"[0-9a-f]{7,40}\+?|unknown", checkpoint.find_commit())
 
 
-def test_the_commit_of_code_installed_in_somebody_elses_repository_is_unknown(tmp_path, monkeypatch):
+def test_the_commit_of_code_installed_in_another_repository_is_unknown(tmp_path, monkeypatch):
     (tmp_path / "venv/stereoweave/learn").mkdir(parents=True)
     git = ["git", "-C", str(tmp_path), "-c", "user.name=x", "-c", "user.email=x"]
     for command in (["init", "-q"], ["commit", "-q", "--allow-empty", "-m", "x"]):
@@ -149,7 +149,7 @@ def test_the_commit_of_code_installed_in_somebody_elses_repository_is_unknown(tm
     assert re.fullmatch(r"[0-9a-f]{7,40}", checkpoint.find_commit())
 
 
-def test_a_run_starts_with_the_weights_of_its_seed_and_nothing_behind_it():
+def test_a_run_starts_with_the_weights_of_its_seed_and_without_a_history():
     start, again, other = (
         checkpoint.make_initial(replace(RECIPE, seed=seed), "0123abc") for seed in (1, 1, 2)
     )
@@ -160,11 +160,11 @@ def test_a_run_starts_with_the_weights_of_its_seed_and_nothing_behind_it():
 
 
 def gone_on(start, value):
-    """A run from `start` of a network of one weight."""
+    """Return a run that started from `start`, of a network with one weight."""
     return replace(start, averaged={"weight": torch.tensor([value])}, origin=start.as_origin(), hours=3.0)
 
 
-def test_the_mean_of_two_runs_lies_half_way_and_names_both_and_their_start_once(trained):
+def test_the_average_of_two_runs_lies_halfway_and_names_both_and_their_start_once(trained):
     start = replace(trained, hours=2.0)
     first, second = gone_on(start, 1.0), replace(gone_on(start, 4.0), commit="another")
     found = checkpoint.average(first, second, start)
@@ -174,13 +174,13 @@ def test_the_mean_of_two_runs_lies_half_way_and_names_both_and_their_start_once(
     assert commits == [start.commit, first.commit, "another"]
 
 
-def test_runs_that_did_not_start_alike_have_no_mean(trained):
+def test_runs_that_did_not_start_alike_cannot_be_averaged(trained):
     first = gone_on(trained, 1.0)
-    with pytest.raises(FormatError, match="found one that did not"):
+    with pytest.raises(FormatError, match="found one with a different origin"):
         checkpoint.average(first, trained, trained)
 
 
-def test_averaged_weights_alone_are_small_and_a_run_can_start_from_them(tmp_path):
+def test_a_file_of_averaged_weights_is_small_and_a_run_can_start_from_it(tmp_path):
     network = untrained()
     kept = replace(checkpoint_of(network), optimiser={"state": torch.zeros(10)})
     checkpoint.save(checkpoint.strip_to_average(kept), tmp_path / "weights.pt")
@@ -191,7 +191,7 @@ def test_averaged_weights_alone_are_small_and_a_run_can_start_from_them(tmp_path
     start = checkpoint.make_initial(replace(RECIPE, start_from=str(tmp_path / "weights.pt")), "0123abc")
     assert start.origin[-1]["step"] == RECIPE.steps
     for name, value in network.state_dict().items():
-        # 11 bits of a float16's fraction.
+        # A float16 has a precision of 11 bits.
         torch.testing.assert_close(start.weights[name], value, rtol=1e-3, atol=1e-6)
 
 
@@ -204,7 +204,7 @@ def test_averaged_weights_alone_are_small_and_a_run_can_start_from_them(tmp_path
         (b"PK\x03\x04", r"one that \S.+"),
     ],
 )
-def test_what_is_no_checkpoint_is_refused_with_a_reason(tmp_path, content, found):
+def test_a_file_that_is_not_a_checkpoint_is_refused_with_a_reason(tmp_path, content, found):
     path = tmp_path / "last.pt"
     path.write_bytes(content)
     for load, expected in (

@@ -10,7 +10,7 @@ from stereoweave.learn.distributed import ProcessRank, choose_thread_count, read
 
 @pytest.fixture
 def started(monkeypatch):
-    """As torchrun starts a process."""
+    """Return a function that sets the environment of a process that torchrun started."""
 
     def start(rank, count, here):
         monkeypatch.setenv("TORCHELASTIC_RUN_ID", "none")
@@ -31,13 +31,13 @@ def test_a_process_that_torchrun_did_not_start_is_alone(monkeypatch):
     assert list(read_rank().own_micro_batches(3)) == [0, 1, 2]
 
 
-def test_a_process_of_torchrun_knows_its_place(started):
+def test_a_process_that_torchrun_started_reads_its_rank(started):
     started(5, 8, 4)
     assert read_rank() == ProcessRank(5, 8, 4)
     assert list(read_rank().own_micro_batches(16)) == [10, 11]
 
 
-def test_the_first_process_tells_an_error_at_once_and_the_others_wait_to_be_ended(started, monkeypatch):
+def test_rank_0_raises_an_error_at_once_and_the_others_wait_to_be_ended(started, monkeypatch):
     waited = []
     monkeypatch.setattr(time, "sleep", waited.append)
     for rank in (0, 1, 2):
@@ -46,7 +46,7 @@ def test_the_first_process_tells_an_error_at_once_and_the_others_wait_to_be_ende
     assert waited == [20, 20]
 
 
-def test_who_only_finds_that_another_process_is_gone_waits_too(started, monkeypatch):
+def test_a_rank_that_loses_its_connection_to_another_one_also_waits(started, monkeypatch):
     waited = []
     monkeypatch.setattr(time, "sleep", waited.append)
     for rank, count in ((0, 1), (0, 2), (1, 2)):
@@ -56,7 +56,7 @@ def test_who_only_finds_that_another_process_is_gone_waits_too(started, monkeypa
     assert waited == [20, 20]
 
 
-def test_processes_of_a_machine_share_its_cores_unless_the_user_chose_threads(started, monkeypatch):
+def test_processes_of_a_machine_share_its_cores_unless_the_user_sets_the_threads(started, monkeypatch):
     monkeypatch.setattr(distributed, "usable_cores", lambda: 12)
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     assert choose_thread_count() is None
@@ -66,7 +66,7 @@ def test_processes_of_a_machine_share_its_cores_unless_the_user_chose_threads(st
     assert choose_thread_count() is None
 
 
-def test_the_one_thread_that_torchrun_sets_is_no_choice_of_the_user(started, monkeypatch):
+def test_the_single_thread_that_torchrun_sets_does_not_count_as_the_users_choice(started, monkeypatch):
     monkeypatch.setattr(distributed, "usable_cores", lambda: 12)
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     assert choose_thread_count() is None

@@ -31,7 +31,7 @@ PAPER = recipe_of("fast_depth", max_disparity_px=32.0, exponent=2.0)
 
 
 def kept_of(recipe, change=lambda network: None):
-    """A checkpoint of a network with random weights, changed before they are kept."""
+    """Return a checkpoint of a network with random weights, which `change` has modified."""
     torch.manual_seed(0)
     network = build_network(recipe)
     change(network)
@@ -40,7 +40,7 @@ def kept_of(recipe, change=lambda network: None):
 
 @torch.no_grad()
 def answer_half(network):
-    """Have the network give the code 0.5 everywhere, which is the sigmoid of 0."""
+    """Make the network predict the code 0.5, the sigmoid of 0, everywhere."""
     network.head.to_code.weight.zero_()
     network.head.to_code.bias.zero_()
 
@@ -56,7 +56,10 @@ KEPT = {
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Runs, and pairs: of 6 and 14 px for training, of 4 and 12 px for scores; a quarter of each is near."""
+    """Return a folder of runs and of their pairs.
+
+    Training pairs have disparities of 6 and 14 px, held-out ones of 4 and 12 px; a quarter of each is near.
+    """
     folder = tmp_path_factory.mktemp("runs")
     keep_pairs(folder / "pairs", VALIDATION_SEED, PAPER.validation_pairs)
     training = CachedPairs(folder / "pairs", PAPER.seed, PAPER.pairs, PAIR_SIZE)
@@ -75,20 +78,20 @@ def rows(folder):
     return {row.method: row for row in evaluate([folder / name for name in KEPT], folder / "pairs", QUIET)}
 
 
-def test_the_runs_follow_what_every_table_has(rows):
+def test_the_runs_follow_the_baselines(rows):
     assert list(rows) == ["ground truth", "no warping", "sgbm", "median", *KEPT]
 
 
-def test_a_checkpoint_is_scored_as_the_folder_of_its_run_is(folder, rows):
+def test_a_checkpoint_gets_the_scores_of_its_run_folder(folder, rows):
     (folder / "kept.pt").write_bytes((folder / "random" / "last.pt").read_bytes())
     *_, row = evaluate([folder / "kept.pt"], folder / "pairs", QUIET)
     assert row == replace(rows["random"], method="kept", epe_cm=row.epe_cm)
 
 
-def test_a_disparity_that_is_the_same_everywhere_has_the_error_that_it_must(rows):
+def test_a_constant_disparity_has_the_expected_error(rows):
     assert rows["ground truth"].epe_px == 0
     assert rows["no warping"].epe_px == 0.75 * 4 + 0.25 * 12
-    # Of the training pairs, where the wall's 6 px are the median.
+    # The median is that of the training pairs, the wall's 6 px.
     assert rows["median"].epe_px == 0.75 * 2 + 0.25 * 6
     # Half of 32 px; and with p = 2 its 32 sqrt(0.5) px.
     assert rows["straight"].epe_px == pytest.approx(0.75 * 12 + 0.25 * 4)
@@ -147,7 +150,7 @@ def test_a_depth_becomes_the_disparity_of_each_pair_s_own_camera():
     assert row.epe_cm == pytest.approx(100 * np.mean(errors_m), rel=1e-5)
 
 
-def test_the_median_is_of_what_is_known(rng):
+def test_the_median_ignores_unknown_disparities(rng):
     sample = box_before_a_wall(rng, wall_px=4, box_px=12)
     unknown = np.where(sample.disparity_px == 4, np.float32("nan"), sample.disparity_px)
     match = make_median_method(Listed([replace(sample, disparity_px=unknown)]))
@@ -158,11 +161,11 @@ def test_runs_with_other_held_out_pairs_are_scored_apart(folder):
     (folder / "more").mkdir()
     checkpoint.save(kept_of(replace(PAPER, validation_pairs=3)), folder / "more" / "last.pt")
     message = complaint(evaluate, [folder / "random", folder / "more"], folder / "pairs", QUIET)
-    assert message.startswith("more: expected the pairs of random, (")
+    assert message.startswith("more: expected the held-out pairs of random, (")
     assert message.endswith("; score it separately")
 
 
 @pytest.mark.parametrize("other", ["elsewhere/random", "median"])
-def test_two_rows_of_one_name_are_refused(folder, other):
+def test_two_rows_with_the_same_name_are_refused(folder, other):
     message = complaint(evaluate, [folder / "random", folder / other], folder / "pairs", QUIET)
-    assert message.startswith(f"{other.split('/')[-1]}: expected run folders of different names")
+    assert message.startswith(f"{other.split('/')[-1]}: expected a unique name of a run other than 'median'")

@@ -18,8 +18,8 @@ NEEDED = {
     "warm_up_steps": 4,
     "cool_down_steps": 2,
 }
-COUNT = "expected a whole number of at least 1 and at most 64 bits"
-TABLE = "expected a table of sets and their weights above 0"
+COUNT = "expected a whole number of at least 1 that fits in 64 bits"
+TABLE = "expected a table of sets with weights above 0"
 
 
 @pytest.mark.parametrize("file", RECIPES, ids=lambda file: file.name)
@@ -52,11 +52,11 @@ def test_a_mix_is_a_table_of_sets_and_weights_and_survives_being_a_dictionary(tm
     assert recipe == Recipe(**NEEDED, mix=(("collage", 0.5), ("runs/synth/rooms", 2)))
     assert hash(recipe) != hash(Recipe(**NEEDED))
     assert parse_recipe(asdict(recipe), "here") == recipe
-    # As a checkpoint's card keeps it.
+    # As it is stored in a checkpoint's card.
     assert parse_recipe(json.loads(json.dumps(asdict(recipe))), "here") == recipe
 
 
-def test_a_recipe_for_a_dataset_on_disk_is_bound_by_no_pair_size():
+def test_the_pair_size_does_not_limit_the_crops_of_a_dataset_on_disk():
     recipe = parse_recipe(
         NEEDED | {"dataset": "sintel", "root": "datasets/sintel", "crop_size": [384, 1024]}, "here"
     )
@@ -76,9 +76,9 @@ def test_table_1_has_a_recipe_for_each_of_its_cells():
         assert recipe.name == name
         assert (recipe.dataset, recipe.model) == cell
         assert recipe.target == ("depth" if recipe.dataset == "paper" else "disparity")
-        # The paper's: Adam and batches of 4 pairs.
+        # As in the paper: Adam and batches of 4 pairs.
         assert (recipe.batch, recipe.weight_decay, recipe.averaged_steps) == (4, 0.0, 1)
-        # Its own two contributions, and the transfer, are for its own network alone.
+        # Only the paper's own network uses its two contributions and the transfer.
         own = (1.5, 1.0, "checkpoints/fast_depth.pt") if recipe.model == "fast_depth" else (1.0, 0.0, "")
         assert (recipe.exponent, recipe.alpha_p, recipe.start_from) == own
 
@@ -89,7 +89,7 @@ def test_the_learning_rate_rises_stays_and_falls():
     assert rates == [0.25, 0.5, 0.75, 1, 1, 1, 1, 1, 1, 0.5]
 
 
-def test_the_learning_rate_without_slopes_is_constant():
+def test_the_learning_rate_without_warm_up_and_cool_down_is_constant():
     recipe = Recipe(**NEEDED | {"warm_up_steps": 0, "cool_down_steps": 0})
     assert {recipe.learning_rate_at(step) for step in range(10)} == {1.0}
 
@@ -106,7 +106,7 @@ def test_the_learning_rate_without_slopes_is_constant():
         ("a" + ".a" * 50_000 + " = 1", "more than 10000 characters"),
     ],
 )
-def test_a_recipe_made_to_do_harm_is_refused_at_once(tmp_path, text, found):
+def test_a_malicious_recipe_is_refused_at_once(tmp_path, text, found):
     file = tmp_path / "hostile.toml"
     file.write_text(text)
     with pytest.raises(FormatError, match=f"hostile.toml: .*{found}"):
@@ -124,7 +124,7 @@ def test_a_recipe_made_to_do_harm_is_refused_at_once(tmp_path, text, found):
         ({"learning_rate": 10**400}, f"learning_rate: expected a number above 0, found 1{'0' * 99}..."),
         ({"learning_rate": "high"}, "learning_rate: expected a number above 0, found 'high'"),
         ({"learning_rate": False}, "learning_rate: expected a number above 0, found False"),
-        ({"name": 3}, "name: expected a text in quotes, found 3"),
+        ({"name": 3}, "name: expected text in quotes, found 3"),
         ({"crop_size": 256}, "crop_size: expected two whole numbers of at least 1, found 256"),
         ({"crop_size": [256]}, "crop_size: expected two whole numbers of at least 1, found [256]"),
         ({"crop_size": [256, 1.5]}, "crop_size: expected two whole numbers of at least 1, found [256, 1.5]"),
@@ -136,16 +136,16 @@ def test_a_recipe_made_to_do_harm_is_refused_at_once(tmp_path, text, found):
         ({"validation_pairs": 0}, f"validation_pairs: {COUNT}, found 0"),
         ({"validate_every": 0}, f"validate_every: {COUNT}, found 0"),
         ({"averaged_steps": 0}, f"averaged_steps: {COUNT}, found 0"),
-        ({"seed": 2**63}, "seed: expected a whole number of at most 64 bits, found 9223372036854775808"),
+        ({"seed": 2**63}, "seed: expected a whole number that fits in 64 bits, found 9223372036854775808"),
         (
             {"micro_batch": -1},
-            "micro_batch: expected a whole number of at least 0 and at most 64 bits, found",
+            "micro_batch: expected a whole number of at least 0 that fits in 64 bits, found",
         ),
         ({"max_disparity_px": 0.0}, "max_disparity_px: expected a number above 0, found 0.0"),
         ({"max_disparity_px": float("inf")}, "max_disparity_px: expected a number above 0, found inf"),
         ({"max_depth_m": 0.0}, "max_depth_m: expected a number above 0, found 0.0"),
         ({"fit_exponent": "yes"}, "fit_exponent: expected true or false, found 'yes'"),
-        ({"loss": 2}, "loss: expected a text in quotes, found 2"),
+        ({"loss": 2}, "loss: expected text in quotes, found 2"),
         ({"exponent": float("nan")}, "exponent: expected a number of at least 1, found nan"),
         ({"alpha_z": float("inf")}, "alpha_z: expected a number of at least 0, found inf"),
         ({"augment": 1}, "augment: expected true or false, found 1"),
@@ -156,7 +156,7 @@ def test_a_recipe_made_to_do_harm_is_refused_at_once(tmp_path, text, found):
         ({"weight_decay": -0.1}, "weight_decay: expected a number of at least 0, found -0.1"),
         ({"target": "height"}, "target: expected 'disparity' or 'depth', found 'height'"),
         ({"dataset": "sintel"}, "root: expected the dataset's folder, found '' with dataset = 'sintel'"),
-        ({"root": "sintel"}, "root: expected none for collage, found 'sintel' with dataset = 'collage'"),
+        ({"root": "sintel"}, "root: expected no folder, found 'sintel' with dataset = 'collage'"),
         ({"mix": "collage"}, f"mix: {TABLE}, such as collage = 0.5, found 'collage'"),
         ({"mix": {"collage": "half"}}, f"mix: {TABLE}, such as collage = 0.5, found {{'collage': 'half'}}"),
         ({"mix": [["collage", 1, 2]]}, f"mix: {TABLE}, such as collage = 0.5, found [['collage', 1, 2]]"),
@@ -167,7 +167,7 @@ def test_a_recipe_made_to_do_harm_is_refused_at_once(tmp_path, text, found):
         ),
         (
             {"mix": {"collage": 1.0}, "dataset": "sintel", "root": "sintel"},
-            "mix: expected dataset = 'collage', on which a mix is validated, found 'sintel'",
+            "mix: expected dataset = 'collage' to validate the mix on, found 'sintel'",
         ),
         ({"learning_rate": float("nan")}, "learning_rate: expected a number above 0, found nan"),
         ({"offset_share": 1.5}, "offset_share: expected a number from 0 to 1, found 1.5"),
@@ -176,7 +176,7 @@ def test_a_recipe_made_to_do_harm_is_refused_at_once(tmp_path, text, found):
         ({"held_out": {"rooms": 1}}, "held_out: expected a table of names and folders, such as rooms"),
     ],
 )
-def test_a_wrong_key_or_value_is_named_in_one_line(changes, message):
+def test_an_error_names_a_wrong_key_or_value_in_one_line(changes, message):
     with pytest.raises(FormatError) as caught:
         parse_recipe(NEEDED | changes, "my.toml")
     assert str(caught.value).startswith(f"my.toml: {message}")
@@ -184,7 +184,7 @@ def test_a_wrong_key_or_value_is_named_in_one_line(changes, message):
 
 
 @pytest.mark.parametrize("missing", NEEDED)
-def test_a_missing_key_is_named_in_one_line(missing):
+def test_an_error_names_a_missing_key_in_one_line(missing):
     values = {name: value for name, value in NEEDED.items() if name != missing}
     with pytest.raises(FormatError) as caught:
         parse_recipe(values, "my.toml")
@@ -202,7 +202,7 @@ def test_a_missing_key_is_named_in_one_line(missing):
         b"steps = " + b"{a = " * 20_000,
     ],
 )
-def test_a_file_that_is_no_toml_is_named_in_one_line(tmp_path, content):
+def test_an_error_names_a_file_that_is_not_toml_in_one_line(tmp_path, content):
     file = tmp_path / "bad.toml"
     file.write_bytes(content)
     with pytest.raises(FormatError) as caught:
@@ -211,12 +211,12 @@ def test_a_file_that_is_no_toml_is_named_in_one_line(tmp_path, content):
     assert "\n" not in str(caught.value)
 
 
-def test_a_recipe_without_end_is_refused():
+def test_an_endless_recipe_is_refused():
     with pytest.raises(FormatError, match="/dev/zero: expected a regular file, found a pipe or a device"):
         read_recipe(Path("/dev/zero"))
 
 
-def test_a_file_that_is_not_there_is_named(tmp_path):
+def test_an_error_names_a_missing_file(tmp_path):
     with pytest.raises(FormatError, match=r"nowhere\.toml: expected a recipe in TOML, found no such file"):
         read_recipe(tmp_path / "nowhere.toml")
 
@@ -230,6 +230,6 @@ def test_a_step_has_one_micro_batch_unless_the_recipe_says_otherwise():
 @pytest.mark.parametrize(
     ("micro_batch", "expected"), [(3, "a divisor of batch = 4"), (8, "a divisor"), (-1, "a .* at least 0")]
 )
-def test_micro_batches_that_a_batch_cannot_be_parted_into_are_refused(micro_batch, expected):
+def test_micro_batches_that_do_not_divide_the_batch_are_refused(micro_batch, expected):
     with pytest.raises(FormatError, match=f"here: micro_batch: expected {expected}.*, found {micro_batch}"):
         parse_recipe(NEEDED | {"micro_batch": micro_batch}, "here")
