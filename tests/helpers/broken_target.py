@@ -1,4 +1,4 @@
-"""Fuzzing target that fails as its files command, for the tests of the fuzzer."""
+"""Fuzzing target that fails in the way that its input files request, for the tests of the fuzzer."""
 
 import os
 import signal

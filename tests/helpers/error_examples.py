@@ -17,7 +17,7 @@ LAYOUTS = (
 
 
 def write_error_examples(folder: Path) -> None:
-    """Write a pair, the same with the right picture 2 px lower, plain pictures, and a calibration."""
+    """Write a pair, the same pair with the right picture 2 px lower, plain pictures, and a calibration."""
     for name in ("left.png", "right.png"):
         shutil.copy(TEXTURED / name, folder)
     left, right = (read_image(TEXTURED / name) for name in ("left.png", "right.png"))

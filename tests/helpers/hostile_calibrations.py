@@ -7,7 +7,7 @@ import struct
 from fuzz.targets.calibrations import KALIBR, MIDDLEBURY
 
 MATRIX = [500, 0, 320, 0, 500, 240, 0, 0, 1]
-# Flat content of a calibration: a list is a matrix of three columns, or of one row.
+# Content of a calibration without nesting: a list is a matrix of three columns, or of one row.
 RIG = {
     "M1": MATRIX,
     "D1": [0.1, -0.2, 0.001, 0.002, 0.03],

@@ -10,7 +10,7 @@ from itertools import chain, repeat
 import httpx
 
 Sender = Callable[[httpx.Client], tuple[int, str]]
-# Enough to notice a server that keeps all of it in memory.
+# Large enough to expose a server that keeps a whole request in memory.
 _ENDLESS = 64_000_000
 _POST = b"POST /disparity HTTP/1.1\r\nHost: localhost\r\n"
 _FORM = b"Content-Type: multipart/form-data; boundary=b\r\n"
@@ -19,7 +19,7 @@ _PART = b'--b\r\nContent-Disposition: form-data; name="left"; filename="l"\r\n\r
 
 
 def make_hostile_requests() -> dict[str, Sender]:
-    """Requests by what each does; the status is 0 if the connection is closed without a response."""
+    """Return requests keyed by what each does; status 0 means a connection closed without a response."""
     once = _make_heads() | _make_methods() | _make_hosts() | _make_lengths() | _make_bodies()
     once |= _make_other_protocols()
     return {
@@ -196,7 +196,7 @@ def _leave(start: bytes, reset: bool, client: httpx.Client) -> tuple[int, str]:
 
 
 def _send_parts(parts: Iterable[bytes], client: httpx.Client) -> tuple[int, str]:
-    """Send bytes, as many as are accepted; return the status of the response."""
+    """Send as many bytes as the server accepts; return the status of the response."""
     with _connect(client) as connection:
         try:
             for part in parts:

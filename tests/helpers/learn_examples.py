@@ -1,4 +1,4 @@
-"""Shared by the tests of training: a pair with truth by construction, and a network trained on it."""
+"""Shared by the tests of training: a pair with exact ground truth, and a network trained on it."""
 
 import functools
 import json
@@ -41,9 +41,9 @@ CAMERA = StereoCamera(focal_px=120.0, baseline_m=0.2, cx_px=47.5, cy_px=31.5)
 
 
 def recipe_of(model, **changes):
-    """RECIPE with another model and its loss; PSMNet gets only 48 candidates.
+    """Return RECIPE with another model and its loss; PSMNet gets only 48 candidates.
 
-    Not 32, for which a volume is 2 levels deep and oneDNN's bfloat16 gradient is wrong.
+    With 32 candidates a volume would be 2 levels deep, for which oneDNN's bfloat16 gradient is wrong.
     """
     loss = "weave" if model.startswith("weave") else "l2"
     return replace(RECIPE, **{"model": model, "loss": loss, "max_disparity_px": 48.0, **changes})
@@ -55,7 +55,7 @@ def texture(rng, height, width):
 
 
 def box_before_a_wall(rng, size=PAIR_SIZE, wall_px=4, box_px=12):
-    """Sample of two flat surfaces; the box covers the middle half of the left view's rows and columns."""
+    """Return a sample of two flat surfaces; the box covers the middle half of the left rows and columns."""
     height, width = size
     wall, box = texture(rng, height, width + wall_px), texture(rng, height // 2, width // 2)
     rows, start = slice(height // 4, height // 4 + height // 2), width // 4
@@ -64,7 +64,7 @@ def box_before_a_wall(rng, size=PAIR_SIZE, wall_px=4, box_px=12):
     in_right[rows, start - box_px : start - box_px + width // 2] = True
     left, right = wall[:, :width].copy(), wall[:, wall_px:].copy()
     left[in_left], right[in_right] = box.reshape(-1, 3), box.reshape(-1, 3)
-    # The wall's column x in the left view is at x - wall_px in the right one.
+    # The wall's column x in the left view is column x - wall_px in the right view.
     occluded, right_occluded = np.ones((2, height, width), bool)
     occluded[:, wall_px:] = in_right[:, :-wall_px]
     right_occluded[:, :-wall_px] = in_left[:, wall_px:]
@@ -88,7 +88,7 @@ def keep_pairs(folder, seed, count, size=PAIR_SIZE):
 
 
 def make_batches_in_place(patch):
-    """Make batches in the training process itself: another one takes seconds to load PyTorch."""
+    """Make batches in the training process itself, because another process takes seconds to load PyTorch."""
     patch.setattr(
         "stereoweave.learn.training.loop._load_batches",
         lambda batches, first: ((step, batches[step]) for step in range(first, batches.recipe.steps)),
@@ -150,7 +150,7 @@ class Overfitted:
 
 @functools.cache
 def overfitted(name="weave_small", steps=45) -> Overfitted:
-    """Overfit a network to one pair; also return its mean error on that pair before and after."""
+    """Overfit a network to one pair; also return its mean error on the pair before and after training."""
     network, sample = untrained(name), box_before_a_wall(np.random.default_rng(0))
     batch = collate([sample])
     before_px = mean_error_px(network, batch)
@@ -175,7 +175,7 @@ def mean_error_px(network, batch) -> float:
 
 
 def write(recipe, file):
-    """Write the recipe to the file; return the path."""
+    """Write the recipe to the file and return the file's path."""
     lines = (f"{name} = {json.dumps(value)}" for name, value in asdict(recipe).items())
     file.write_text("\n".join(lines) + "\n")
     return file

@@ -17,7 +17,7 @@ def matcher_file(
 ) -> Path:
     """Write a matcher file from graph nodes, which may use the constants below.
 
-    `size`: batch, height and width of its inputs; numbers, or names for free dimensions.
+    `size` holds batch, height and width of the inputs as numbers, or as names for dynamic dimensions.
     """
     batch, height, width = size
     graph = helper.make_graph(
@@ -44,7 +44,7 @@ def matcher_file(
 
 
 def red_of(image: str, output: str):
-    """Nodes that output the red channel of an image in 0..255, in which tests encode disparity."""
+    """Return nodes that output an image's red channel in 0..255, in which tests encode disparity."""
     return [
         helper.make_node("Gather", [image, "red"], [f"{output}_red"], axis=1),
         helper.make_node("Mul", [f"{output}_red", "scale"], [output]),
@@ -52,7 +52,7 @@ def red_of(image: str, output: str):
 
 
 def of_fixed_size(model: str, path: Path, height: int, width: int) -> Path:
-    """Write a shipped network as a matcher file of fixed input size."""
+    """Write a shipped network as a matcher file for a fixed input size."""
     graph = onnx.load(model_file(model))
     for value in (*graph.graph.input, *graph.graph.output):
         dims = value.type.tensor_type.shape.dim

@@ -1,4 +1,4 @@
-"""Helpers for processes and ports."""
+"""Helpers for other processes and for ports."""
 
 import signal
 import socket
@@ -13,7 +13,7 @@ import psutil
 
 @contextmanager
 def halted(process: subprocess.Popen[Any] | psutil.Process) -> Iterator[None]:
-    """Stop a process during the block; it keeps its resources."""
+    """Halt a process during the block; it keeps its resources."""
     process.send_signal(signal.SIGSTOP)
     try:
         yield

@@ -1,4 +1,4 @@
-"""The page, served by its command, and a client without a browser."""
+"""The page as its command serves it, and a client without a browser."""
 
 import json
 import os
@@ -22,7 +22,7 @@ SERVER = [
 
 def start(folder: Path, *words: str) -> tuple[subprocess.Popen[str], str]:
     """Start a separate server with its temporary files in `folder`; return it and its address."""
-    # If a shell or nohup runs the tests in the background, both are ignored, which processes inherit.
+    # A shell or nohup that runs the tests in the background ignores both signals, and processes inherit that.
     before = {number: signal.signal(number, signal.SIG_DFL) for number in (signal.SIGINT, signal.SIGHUP)}
     server = subprocess.Popen(
         [*SERVER, "--port", "0", *words],
@@ -49,7 +49,7 @@ def stop(server: subprocess.Popen[str], number: signal.Signals = signal.SIGINT) 
 
 
 def file_data(path: Any, **more: Any) -> dict[str, Any]:
-    """Reference to a file in the format of Gradio's client."""
+    """Return a reference to a file in the format of Gradio's client."""
     return {"path": path, "meta": {"_type": "gradio.FileData"}, **more}
 
 
@@ -75,14 +75,14 @@ class Visitor:
         return answer.json()
 
     def press(self, button: str = "find", **given: Any) -> dict[str, Any]:
-        """Request body for a button of the form, with some fields filled in."""
+        """Return the request body for a button of the form, with some fields filled in."""
         number, inputs = self._inputs[button]
         form = {"model": "small", "rectify": False, "layout": "detected", "position": 0.5} | given
         data = [form.get(self._fields[part]) for part in inputs]
         return {"data": data, "fn_index": number, "session_hash": uuid4().hex}
 
     def answer(self, body: dict[str, Any]) -> tuple[int, str]:
-        """Status and text of the response; if the page starts a job, those of the job."""
+        """Return status and text of the response, or of the job if the page starts one."""
         joined = self.http.post("/gradio_api/queue/join", json=body)
         if joined.status_code != 200:
             return joined.status_code, joined.text

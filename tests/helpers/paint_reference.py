@@ -12,7 +12,7 @@ def rectangle(left, top, right, bottom, canvas):
 
 
 def sampled(image, shift_px):
-    """Image [H, W, C] shifted to x + shift_px by linear interpolation; the borders repeat."""
+    """Sample the image [H, W, C] at x + shift_px by linear interpolation; the borders repeat."""
     height, width = shift_px.shape
     column = np.clip(np.arange(width) + shift_px, 0, width - 1)
     before = np.minimum(column.astype(int), width - 2)
@@ -22,7 +22,7 @@ def sampled(image, shift_px):
 
 
 def plain_view(scene, side):
-    """Image and disparity of a view; side 0 is left, 1 right."""
+    """Return image and disparity of a view; side 0 is the left view, 1 the right one."""
     layers = [plain_layer(scene, layer, side) for layer in scene.layers]
     nearest = np.max([np.where(field >= 0, d, -1) for field, d in layers], axis=0)
     opaque = np.max([np.where(field >= 0.5, d, -1) for field, d in layers], axis=0)
@@ -34,7 +34,7 @@ def plain_view(scene, side):
 
 
 def plain_layer(scene, layer, side):
-    """Field and disparity over the whole view."""
+    """Return field and disparity over the whole view."""
     patch, d = layer.patch, layer.surface.over(layer.patch).astype(float)
     field = np.full((scene.height, scene.width), -REACH_PX)
     disparity_px = np.zeros((scene.height, scene.width))
@@ -69,7 +69,7 @@ def mapped(mapping, x, y):
 
 
 def mirrored(image, u, v):
-    """Sample bilinearly; the image is continued by reflection."""
+    """Sample the image bilinearly; beyond its borders it is reflected."""
     there_and_back = [np.r_[0:n, n - 2 : 0 : -1] for n in image.shape[:2]]
     result = 0
     for dv in (0, 1):

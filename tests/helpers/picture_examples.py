@@ -11,7 +11,7 @@ from stereoweave.errors import FormatError
 
 
 def profile(name, red, green, blue):
-    """ICC profile, version 4, of these primaries as XYZ under D50, with the curve of sRGB."""
+    """Return an ICC profile, version 4, with these primaries (XYZ under D50) and the curve of sRGB."""
 
     def fixed(*values):
         return b"".join(struct.pack(">i", round(value * 65536)) for value in values)
@@ -43,7 +43,7 @@ DISPLAY_P3 = (0.5151, 0.2412, -0.0011), (0.2920, 0.6922, 0.0419), (0.1571, 0.066
 
 
 def png_of(width_px, height_px):
-    """PNG whose header claims this size, with hardly any content."""
+    """Return a PNG with hardly any content whose header claims this size."""
     content = io.BytesIO()
     Image.new("L", (1, 1)).save(content, "PNG")
     head = b"IHDR" + struct.pack(">LL", width_px, height_px) + content.getvalue()[24:29]

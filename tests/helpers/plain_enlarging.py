@@ -7,7 +7,7 @@ NEVER = 30000
 
 
 def plain_costs(codes, grey, other_codes, other_grey, first):
-    """Matching cost of each candidate [H, W, 2, BAND]; first [H, W, 2] is each band's least disparity."""
+    """Return each candidate's cost [H, W, 2, BAND]; `first` [H, W, 2] is the least disparity of each band."""
     height, width = grey.shape
     disparity_px = first[..., None].astype(int) + np.arange(BAND)
     columns = np.clip(np.arange(width)[:, None, None] - disparity_px, 0, width - 1)
@@ -19,7 +19,7 @@ def plain_costs(codes, grey, other_codes, other_grey, first):
 
 
 def plain_sums(costs, first, grey):
-    """Aggregated costs of each candidate: the sum over paths from left, right, above and below."""
+    """Return each candidate's aggregated cost, the sum over paths from left, right, above and below."""
     total = np.zeros(costs.shape, int)
     for axis in (0, 1):
         for backwards in (False, True):
@@ -50,7 +50,7 @@ def _add_path(costs, first, grey, total):
 
 
 def plain_pick(sums, first):
-    """Disparities of least cost."""
+    """Return the disparities of least cost."""
     found_px = np.empty(first.shape[:2])
     for y, x in np.ndindex(found_px.shape):
         band, candidate = np.unravel_index(sums[y, x].argmin(), sums[y, x].shape)
@@ -64,7 +64,7 @@ def plain_pick(sums, first):
 
 
 def plain_agreed(found_px, other_px):
-    """Whether the other view's disparity at each pixel's match agrees."""
+    """Return the mask of pixels whose disparity agrees with the other view's disparity at their match."""
     agreed = np.zeros(found_px.shape, bool)
     for y, x in np.ndindex(found_px.shape):
         column = round(x - found_px[y, x])
@@ -87,7 +87,7 @@ def plain_filled(known, gap, farthest_px, nearest_px, disparity_px):
 
 
 def plain_hidden(disparity_px, right_disparity_px):
-    """Mask of pixels whose match is outside the right image or behind a nearer surface."""
+    """Return the mask of pixels whose match is outside the right image or behind a nearer surface."""
     hidden = np.ones(disparity_px.shape, bool)
     for y, x in np.ndindex(disparity_px.shape):
         column = round(x - disparity_px[y, x])

@@ -7,7 +7,7 @@ from stereoweave.rendering.canvas_kernels import NOTHING
 
 
 def plain_move(view, targets, disparity_px, before):
-    """Canvas after `camera_motion_kernels.move`, given the canvas before."""
+    """Return the canvas after `camera_motion_kernels.move`, given the canvas before it."""
     lines = zip(view.surface_px, targets, disparity_px, strict=True)
     landed_px, source = np.swapaxes([plain_landing(*line) for line in lines], 0, 1)
     pure = np.isfinite(landed_px)
@@ -25,7 +25,7 @@ def plain_move(view, targets, disparity_px, before):
 
 
 def plain_landing(surface_px, targets, disparity_px):
-    """Nearest disparity that lands on each column of a row (NaN: none), and its fractional source column."""
+    """Return the nearest disparity on each column of a row (NaN: none), and its fractional source column."""
     columns = np.arange(len(targets))
     joined = np.abs(np.diff(surface_px)) <= SAME_SURFACE_PX
     landed_px, source = np.full(len(targets), np.nan), np.zeros(len(targets))
@@ -46,7 +46,7 @@ def plain_landing(surface_px, targets, disparity_px):
 
 
 def plain_lay(hidden_px, colours, shift, offset_px, canvas):
-    """The canvas after `hole_filling_kernels.paint_background`: each pixel shows the nearest background."""
+    """Return the canvas after `hole_filling_kernels.paint_background` painted the nearest background."""
     result = type(canvas)(*(values.copy() for values in canvas))
     height, width = hidden_px.shape
     at = np.arange(width) + shift * hidden_px.astype(float) + offset_px
@@ -63,7 +63,7 @@ def plain_lay(hidden_px, colours, shift, offset_px, canvas):
 
 
 def plain_mix(hidden_px, colours, x, beyond):
-    """Colour at an offset from the hidden pixel x, interpolated towards its neighbour on the same surface."""
+    """Return the colour beside hidden pixel x, interpolated towards its neighbour on the same surface."""
     beside = x + (1 if beyond > 0 else -1)
     if not (0 <= beside < len(hidden_px) and abs(hidden_px[beside] - hidden_px[x]) <= SAME_SURFACE_PX):
         return colours[x]

@@ -4,7 +4,7 @@ import numpy as np
 
 
 def plain_fill(disparity_px, confidence, occluded, seen):
-    """Filled disparity and confidence [H, W]."""
+    """Return filled disparity and confidence [H, W]."""
     visible = ~occluded & seen
     row_px, beside = disparity_px.copy(), confidence.copy()
     for y, x in np.argwhere(~visible):
@@ -24,7 +24,7 @@ def plain_fill(disparity_px, confidence, occluded, seen):
 
 
 def _end(row_px, confidence, visible, x, step):
-    """Lower medians of disparity and confidence over the visible pixels among the 7 at a run's end."""
+    """Return lower medians of disparity and confidence over the visible ones of 7 pixels at a run's end."""
     while 0 <= x < len(row_px) and not visible[x]:
         x += step
     columns = [column for column in range(x, x + 7 * step, step) if 0 <= column < len(row_px)]
@@ -35,7 +35,7 @@ def _end(row_px, confidence, visible, x, step):
 
 
 def _is_between(disparity_px, visible, y, x):
-    """Whether a disparity is within the range of the visible ones on an 11x11 grid with a spacing of 4 px."""
+    """Return whether a disparity is in the range of the visible ones on an 11x11 grid, 4 px apart."""
     rows, columns = (
         4 * np.arange(max(at // 4 - 5, 0), min(at // 4 + 6, -(-size // 4)))
         for at, size in zip((y, x), disparity_px.shape, strict=True)

@@ -6,7 +6,7 @@ OUTSIDE = 65535
 
 
 def plain_costs(own, other, first_px, count):
-    """Matching cost of each candidate [H, W, D]; own and other are `Cues`."""
+    """Return each candidate's matching cost [H, W, D]; `own` and `other` are `Cues`."""
     height, width = own.grey.shape
     volume = np.empty((height, width, count), int)
     here = type(own)(*(cue.astype(int) for cue in own))
@@ -23,7 +23,7 @@ def plain_costs(own, other, first_px, count):
 
 
 def plain_census(grey):
-    """Census code of each pixel: one bit for each of its 24 neighbours, set if it is darker."""
+    """Return each pixel's census code: one bit per neighbour (24), set if the neighbour is darker."""
     around = np.pad(grey, 2, mode="edge")
     height, width = grey.shape
     codes = np.zeros(grey.shape, int)
@@ -35,7 +35,7 @@ def plain_census(grey):
 
 
 def plain_sums(costs, grey):
-    """Aggregated costs of each candidate: the sum over paths from left, right, above and below."""
+    """Return each candidate's aggregated cost, the sum over paths from left, right, above and below."""
     total = np.zeros(costs.shape, int)
     for axis in (0, 1):
         for backwards in (False, True):
@@ -65,7 +65,7 @@ def _add_path(costs, grey, total):
 
 
 def plain_pick(sums, first_px):
-    """Disparities of least cost."""
+    """Return the disparities of least cost."""
     count = sums.shape[2]
     best = sums.argmin(2)
     inner = np.clip(best, 1, count - 2)

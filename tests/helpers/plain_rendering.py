@@ -1,4 +1,4 @@
-"""Plain NumPy reference of the renderer: whole views at once, only splatting pixel by pixel."""
+"""Plain NumPy reference of the renderer, which processes whole views at once and splats pixel by pixel."""
 
 from typing import NamedTuple
 
@@ -15,15 +15,15 @@ class PlainSide(NamedTuple):
     offset_px: float
 
     def column(self, d):
-        """Column in the image of each pixel of the new view, at disparity d."""
+        """Return the column in the image of each pixel of the new view, at disparity d."""
         return np.arange(d.shape[1]) - self.offset_px - self.shift * d
 
 
 def plain_rendering(left, right, estimate, position, convergence_px=0.0):
-    """Image and mask of `stereoweave.render`, and where colours are pure, for positions other than 0 and 1.
+    """Render image and mask like `stereoweave.render`, and the mask of pure colours.
 
-    Outside the baseline the renderer fills impure pixels differently; here they are filled as between the
-    cameras.
+    Positions 0 and 1 are not supported. Beyond the cameras the renderer fills impure pixels differently; here
+    they are filled as between the cameras.
     """
     near, far = abs(1 - position) ** 0.5, abs(position) ** 0.5
     offset_px = (position - 0.5) * convergence_px
@@ -50,7 +50,7 @@ def plain_rendering(left, right, estimate, position, convergence_px=0.0):
 
 
 def plain_splat(disparity_px, shift, offset_px=0.0):
-    """Nearest disparity on each pixel of the new view; NaN if there is none."""
+    """Return the nearest disparity on each pixel of the new view; NaN if there is none."""
     landed = np.full(disparity_px.shape, np.nan)
     columns = np.arange(disparity_px.shape[1])
     for line, row in zip(landed, disparity_px, strict=True):
@@ -72,7 +72,7 @@ def plain_splat(disparity_px, shift, offset_px=0.0):
 
 
 def tap(values, column):
-    """values [H, W, ...] at integer columns [H, W]; the border repeats."""
+    """Return `values` [H, W, ...] at integer columns [H, W]; the border repeats."""
     return values[np.arange(len(values))[:, None], np.clip(column, 0, values.shape[1] - 1)]
 
 
@@ -83,7 +83,7 @@ def linear(values, column):
 
 
 def cubic(values, column):
-    """Catmull-Rom spline through the four neighbours in its textbook form; the border repeats."""
+    """Interpolate by the textbook Catmull-Rom spline through the four neighbours; the border repeats."""
     column = np.clip(column, 0, values.shape[1] - 1)
     whole = np.floor(column).astype(int)
     t = (column - whole)[..., None]
@@ -96,14 +96,14 @@ def inside(side, column):
 
 
 def purity(side):
-    """1, falling to 0.1 where one of the 8 neighbours is nearer by 1 to 2 px of the new view."""
+    """Return 1, or down to 0.1 where one of the 8 neighbours is nearer by 1 to 2 px of the new view."""
     padded = np.pad(side.disparity_px, 1, mode="edge")
     windows = np.lib.stride_tricks.sliding_window_view(padded, (3, 3))
     return np.clip(2 - abs(side.shift) * (windows.max((2, 3)) - side.disparity_px), 0.1, 1)
 
 
 def support(side, d, weight):
-    """Support of each pixel's surface d in the image; weight [H, W] is per pixel of the image."""
+    """Return the support of each pixel's surface d in the image; weight [H, W] is per pixel of the image."""
     column = side.column(d)
     whole = np.floor(column).astype(int)
     parts = [
@@ -124,7 +124,7 @@ def gap(side, d):
 
 
 def mismatch(sides, d):
-    """Difference of both images over three columns of disparity d; NaN if none is inside both."""
+    """Return the difference of both images over three columns at disparity d; NaN if none is inside both."""
     total, count = np.zeros(d.shape), np.zeros(d.shape)
     for k in (-1, 0, 1):
         left, right = (side.column(d) + k for side in sides)
@@ -136,7 +136,7 @@ def mismatch(sides, d):
 
 
 def share_of_left(sides, confidence, a, b):
-    """Share of surface a where a and b are two surfaces; both are finite."""
+    """Return the share of surface a where a and b are two surfaces; both are finite."""
     left, right = sides
     gap_a, gap_b = gap(right, a), gap(left, b)
     trust_a, trust_b = linear(confidence, left.column(a)), linear(confidence, left.column(b))
@@ -152,7 +152,7 @@ def share_of_left(sides, confidence, a, b):
 
 
 def plain_surfaces(sides, confidence):
-    """Front and back disparity of the new view's pixels (NaN: none), and the front's share."""
+    """Return front and back disparity of the new view's pixels (NaN: none), and the front's share."""
     a, b = (plain_splat(side.disparity_px, side.shift, side.offset_px) for side in sides)
     both = np.isfinite(a) & np.isfinite(b)
     same = both & (np.abs(a - b) <= SAME_SURFACE_PX)
@@ -175,7 +175,7 @@ def plain_surfaces(sides, confidence):
 
 
 def aligned(sides, front, back):
-    """front after one least-squares step over 5 x 5 windows."""
+    """Return `front` after one least-squares step over windows of 5x5 pixels."""
     d = np.nan_to_num(front)
     greys = [grey(side.image) for side in sides]
     seen = np.min([support(side, d, purity(side)) for side in sides], axis=0) >= 0.5
@@ -195,7 +195,7 @@ def aligned(sides, front, back):
 
 
 def grey(image):
-    """ITU-R BT.601 luma as integers, with OpenCV's fixed-point weights."""
+    """Return ITU-R BT.601 luma as integers, with OpenCV's fixed-point weights."""
     return (image.astype(int) @ [9798, 19235, 3735] + 2**14) >> 15
 
 
@@ -205,7 +205,7 @@ def windows(values):
 
 
 def plain_colours(sides, front, back, share, front_supports):
-    """Colours, disparity of the surface with the greatest share (NaN: none), and where colours are pure."""
+    """Return colours, disparity of the surface with the greatest share (NaN: none), mask of pure colours."""
     colours, known, seen_by = [], [], []
     back_supports = [support(side, np.nan_to_num(back), purity(side)) for side in sides]
     layers = (front, share, front_supports), (back, 1 - share, back_supports)
@@ -231,7 +231,7 @@ def plain_colours(sides, front, back, share, front_supports):
 
 
 def part_doubles(of_left, left, right, d, both):
-    """Share of the left image; 0 or 1 where one image shows a thin structure missing from the maps."""
+    """Return the left image's share, 0 or 1 where one image shows a thin structure missing from the maps."""
     of_left = of_left.copy()
     agreed = both & (np.abs(left - right).sum(2) <= 30)
     for y, x in np.argwhere(both & ~agreed):
@@ -249,9 +249,9 @@ def part_doubles(of_left, left, right, d, both):
 
 
 def plain_fill(image, seen, pure):
-    """Image and drawn; what is not pure shows what is beside the farther end of its run.
+    """Fill impure pixels from beyond the farther end of their run; return the image and the drawn mask.
 
-    A narrow run shows a mean; others what is mirrored there, if that is of the same surface.
+    A narrow run gets the mean colour there. A wide run mirrors the pixels there that are on the same surface.
     """
     height, width = pure.shape
     filled, drawn = image.copy(), np.isfinite(seen)

@@ -1,4 +1,4 @@
-"""Ray-cast images of known scenes by known cameras, to test rectification."""
+"""Ray-cast images of known scenes through known cameras, to test rectification."""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,7 @@ KANNALA_BRANDT = np.array([-0.02, 0.006, -0.003, 0.0005])
 
 @dataclass(frozen=True)
 class Sphere:
-    """Inside of a sphere around the left camera: equally distant in all directions."""
+    """The inside of a sphere around the left camera, which is equally distant in all directions."""
 
     radius_m: float
 
@@ -30,7 +30,7 @@ class Sphere:
 
 @dataclass(frozen=True)
 class Plane:
-    """Plane through a point, spanned by two orthonormal directions."""
+    """A plane through a point, spanned by two orthonormal directions."""
 
     point_m: np.ndarray
     across: np.ndarray
@@ -48,7 +48,7 @@ class Plane:
 
 
 def turned(*degrees):
-    """Rotation about x, then y, then z."""
+    """Return the rotation about x, then y, then z."""
     x, y, z = (
         cv2.Rodrigues(angle * axis)[0] for angle, axis in zip(np.radians(degrees), np.eye(3), strict=True)
     )
@@ -69,7 +69,7 @@ def _matrix(offset_px):
 
 
 def rig_of(lens, degrees=(1.2, -1.5, 1.8), centre_m=(0.1, 0.003, -0.002)):
-    """Two cameras of one kind, rotated relative to each other and at different heights."""
+    """Return a rig of two cameras of the same kind, rotated relative to each other, at different heights."""
     rotation = turned(*degrees)
     return Rig(
         left=lens(offset_px=(4.0, -6.0)),
@@ -81,7 +81,7 @@ def rig_of(lens, degrees=(1.2, -1.5, 1.8), centre_m=(0.1, 0.003, -0.002)):
 
 
 class Cameras:
-    """The two cameras of a rig; each pixel averages samples x samples rays, which are computed once."""
+    """The two cameras of a rig; each pixel averages `samples` x `samples` rays, which are computed once."""
 
     def __init__(self, rig, samples=2):
         steps = (np.arange(samples) + 0.5) / samples - 0.5
@@ -117,7 +117,7 @@ def _colours(start_m, direction, surfaces, texture, texel_m):
 
 
 def directions(optics, at_px):
-    """Unit viewing directions at pixels x, y: the camera model inverted by Newton's method."""
+    """Return unit viewing directions at pixels x, y; Newton's method inverts the camera model."""
     (fx, _, cx), (_, fy, cy), _ = optics.matrix
     distorted = (at_px - (cx, cy)) / (fx, fy)
     guess = distorted.copy()
@@ -137,7 +137,7 @@ def directions(optics, at_px):
 
 
 def _distorted(ideal, distortion):
-    """OpenCV's pinhole model: k1 k2 p1 p2 k3."""
+    """Distort points by OpenCV's pinhole model with k1 k2 p1 p2 k3."""
     k1, k2, p1, p2, k3 = distortion
     x, y = ideal[..., 0], ideal[..., 1]
     square = x * x + y * y
@@ -152,7 +152,7 @@ def _distorted(ideal, distortion):
 
 
 def project(optics, points_m):
-    """Pixels x, y of points in a camera's coordinates."""
+    """Return the pixels x, y of points in a camera's coordinates."""
     if optics.fisheye:
         radius = np.linalg.norm(points_m[..., :2], axis=-1)
         angle = np.arctan2(radius, points_m[..., 2])
@@ -164,7 +164,7 @@ def project(optics, points_m):
 
 
 def speckle(rng, size_px=1024):
-    """Texture, uint8 RGB, of noise at all scales from 2 texels up, as in photographs."""
+    """Return a texture, uint8 RGB, of noise at all scales from 2 texels up, as in photographs."""
     total = np.zeros((size_px, size_px, 3))
     for octave in range(1, 7):
         noise = rng.standard_normal((size_px >> octave, size_px >> octave, 3)).astype(np.float32)

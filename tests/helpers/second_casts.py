@@ -1,4 +1,4 @@
-"""Exact visibility of one eye's points from the other eye, by a second cast of rays."""
+"""Exact visibility of one eye's points from the other eye, by casting rays a second time."""
 
 import numpy as np
 

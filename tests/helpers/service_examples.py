@@ -16,12 +16,12 @@ TEXTURED = Path(__file__).resolve().parents[1] / "textured_pair"
 LEFT, RIGHT, CALIB = ((TEXTURED / name).read_bytes() for name in ("left.png", "right.png", "calib.txt"))
 BOTH = {"left": LEFT, "right": RIGHT}
 
-# Sends a request to the service; returns status and text of the response.
+# A function that sends a request to the service and returns status and text of the response.
 Sender = Callable[[httpx.Client], tuple[int, str]]
 
 
 def make_malformed_requests(most_megabytes: float) -> dict[str, Sender]:
-    """Requests by what is wrong with each."""
+    """Return requests, keyed by what is wrong with each."""
     files = {**_cut_pictures_off(), **_make_other_files(), **_make_wrong_sizes()}
     pictures = {
         f"left is {what}": partial(_post, "/disparity", {"left": content, "right": RIGHT})
@@ -42,7 +42,7 @@ def _post(path: str, files: Any, client: httpx.Client, **options: Any) -> tuple[
 
 
 def _cut_pictures_off() -> dict[str, bytes]:
-    """Truncated and modified pictures."""
+    """Return truncated and modified pictures."""
     found = {}
     with Image.open(io.BytesIO(LEFT)) as picture:
         for kind in ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "PPM", "GIF", "JPEG2000"):
@@ -91,7 +91,7 @@ def _make_other_files() -> dict[str, bytes]:
 
 
 def _make_wrong_sizes() -> dict[str, bytes]:
-    """Pictures that are too large, too small, unlike the right one, or have false headers."""
+    """Return pictures that are too large, too small, unlike the right one, or have false headers."""
     sizes = {(100_000, 100_000), (2**31 - 1, 2**31 - 1), (0, 0), (0, 64), (20_000, 3_000), (4_000_000_000, 1)}
     heads = {f"PNG that says it has {w}x{h} px": _make_png_head(w, h) for w, h in sorted(sizes)}
     small = {
@@ -130,7 +130,7 @@ def _insert_chunk(name: bytes, content: bytes) -> bytes:
 
 
 def _make_wrong_options() -> dict[str, Sender]:
-    """Invalid field values."""
+    """Return requests with invalid field values."""
     numbers = ("nan", "inf", "-1", "0", "1e400", "x", "1,5")
     of_maps = {
         "range": (
@@ -170,14 +170,14 @@ def _make_wrong_options() -> dict[str, Sender]:
 
 
 def _add_camera(field: str, value: str) -> dict[str, str]:
-    """The field, plus others that make the rest of the request valid."""
+    """Return the field, with others that make the rest of the request valid."""
     camera = {"focal_px": "600", "baseline_m": "0.1"}
     position = {"position": "0.9"} if field == "strength" else {}
     return {**camera, **position, field: value}
 
 
 def _make_wrong_fields() -> dict[str, Sender]:
-    """Missing, surplus and misnamed files."""
+    """Return requests with missing, surplus and misnamed files."""
     files = {
         "no file": {"other": b"x"},
         "no right picture": {"left": LEFT},
@@ -231,7 +231,7 @@ def _make_wrong_calibrations() -> dict[str, Sender]:
 
 
 def _make_wrong_http(most_megabytes: float) -> dict[str, Sender]:
-    """Requests with invalid headers or an invalid order of the body."""
+    """Return requests with invalid headers or with a body in the wrong order."""
     form = "multipart/form-data; boundary=b"
     part = b'--b\r\nContent-Disposition: form-data; name="left"; filename="l"\r\n\r\n'
     bodies = {

@@ -1,4 +1,4 @@
-"""Shared by the tests of sets on disk: quickly made pairs whose truth is known by construction."""
+"""Shared by the tests of sets on disk: pairs that are quickly made and have exact ground truth."""
 
 import os
 import signal
@@ -19,7 +19,7 @@ WALL_PX, BOX_PX = 3, 10
 
 
 def box_before_a_wall(rng: np.random.Generator, size_px: tuple[int, int] = (48, 32)) -> Sample:
-    """Wall below a sky, with a box in front in the middle third of the left view's columns and rows."""
+    """Return a wall below a sky, with a box in front in the middle third of the left columns and rows."""
     width, height = size_px
     left_px, right_px = (np.full((height, width), WALL_PX, np.float32) for _ in range(2))
     rows, start, end = slice(height // 3, 2 * height // 3), width // 3, 2 * width // 3
@@ -37,7 +37,7 @@ def box_before_a_wall(rng: np.random.Generator, size_px: tuple[int, int] = (48, 
 
 @dataclass(frozen=True)
 class PaintedPairMaker:
-    """Make pairs without rendering; at a given pair, kill this process or halt its parent."""
+    """Maker of pairs without rendering, which kills this process or halts its parent at a given pair."""
 
     dies_at: int | None = None
     halts_at: int | None = None

@@ -1,4 +1,4 @@
-"""Type checker for jaxtyping's import hook, whose pytest option accepts such a call for one package only."""
+"""Type checker for jaxtyping's import hook, whose pytest option accepts a call for only one package."""
 
 from beartype import BeartypeConf, beartype
 

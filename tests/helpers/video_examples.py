@@ -18,7 +18,7 @@ Pair = tuple[np.ndarray, np.ndarray]
 
 
 def example_pairs(count: int, *, width: int = 160, height: int = 96, step_px: int = 2) -> list[Pair]:
-    """Windows of the example pair moving to the right, like a video of a camera that moves sideways."""
+    """Return windows of the example pair that move to the right, as seen by a camera moving sideways."""
     left, right = (read_image(TEXTURED / f"{eye}.png") for eye in ("left", "right"))
     top_px, first_px = 200, 180
     return [
@@ -31,7 +31,7 @@ def example_pairs(count: int, *, width: int = 160, height: int = 96, step_px: in
 
 
 def flat_pairs(count: int, *, width: int = 64, height: int = 48) -> list[Pair]:
-    """Pairs of uniform colour by which tests distinguish eyes and frames; the right eye is bluer."""
+    """Return pairs of uniform colour, which distinguishes eyes and frames; the right eye is bluer."""
     return [
         tuple(np.full((height, width, 3), (20 + 8 * index, 100, blue), np.uint8) for blue in (60, 180))
         for index in range(count)
@@ -73,7 +73,7 @@ def write_side_by_side(
     codec: str = "mpeg4",
     **more: object,
 ) -> Path:
-    """Write a video of packed pairs; `more` is passed to `write_video`."""
+    """Write a video of packed pairs; `more` is passed on to `write_video`."""
     frames = [packed(left, right, layout) for left, right in pairs]
     return write_video(path, frames, times_ms=times_ms, sound=sound, codec=codec, **more)
 
@@ -98,14 +98,14 @@ def write_video(
         path: Output file; the extension determines the container.
         frames: uint8 RGB [H, W, 3], all of equal size.
         times_ms: Presentation times in ascending order; default: 25 frames a second.
-        sound: Add a sine of 440 Hz, AAC, as long as the frames.
+        sound: Add a sine of 440 Hz in AAC, as long as the frames.
         codec: FFmpeg's name of an encoder: mpeg4, libx264, libx264rgb, ffv1, mjpeg, ...
         pix_fmt: Pixel format; default: the encoder's preferred one.
         colorspace: FFmpeg's AVCOL_SPC_*: 2 is unspecified, 1 BT.709, 5 and 6 BT.601.
         color_range: 0 unspecified, 1 limited, 2 full.
         stereo_mode: Matroska's frame packing tag, such as "left_right".
         rotation: Anticlockwise rotation in degrees that players must apply.
-        options: Encoder options, such as {"g": "12"}, a key frame every 12.
+        options: Encoder options, such as {"g": "12"} for a key frame every 12 frames.
     """
     times_ms = times_ms if times_ms is not None else [FRAME_MS * index for index in range(len(frames))]
     with av.open(str(path), "w") as container:
@@ -138,7 +138,7 @@ def write_video(
 
 
 def packets(path: Path, kind: str) -> list[tuple[int, bytes]]:
-    """Return time stamp and content of each packet of a kind, "video" or "audio"."""
+    """Return the time stamp and content of each packet of a kind, "video" or "audio"."""
     with av.open(str(path)) as container:
         return [
             (packet.pts, bytes(packet)) for packet in container.demux(**{kind: 0}) if packet.pts is not None

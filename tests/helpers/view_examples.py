@@ -9,7 +9,7 @@ WALL_PX, BOX_PX = 2, 8
 
 
 def boxes_before_a_wall(*boxes: tuple[int, int], width: int = 40, height: int = 3) -> Sample:
-    """Sample whose left view has boxes of disparity 8 in these columns, in front of a wall of disparity 2."""
+    """Return a sample with boxes of disparity 8 in these left columns, before a wall of disparity 2."""
     left_px, right_px = (np.full((height, width), WALL_PX, np.float32) for _ in range(2))
     for start, end in boxes:
         left_px[:, start:end] = BOX_PX

@@ -1,4 +1,4 @@
-"""Drive the page over HTTP like its script, without a browser, which would make network look-ups itself."""
+"""Drive the page over HTTP like its script, without a browser, which would access the network itself."""
 
 from pathlib import Path
 from typing import Any

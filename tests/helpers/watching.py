@@ -1,7 +1,7 @@
 """Monitor a service's response time and memory in a separate process until stopped.
 
-`python watching.py URL PID` writes as JSON how long each health check took, and the memory in MB of all
-processes of the service. It is a separate process because the tests keep their own interpreter busy.
+`python watching.py URL PID` writes the time of each health check, and the memory in MB of all processes of
+the service, as JSON. The process is separate, because the tests keep their own interpreter busy.
 """
 
 import json
@@ -22,7 +22,7 @@ def list_descendants(pid: int) -> list[int]:
 
 
 def measure_megabytes(pid: int) -> float:
-    """Memory of a process, with its proportional share of shared memory; 0 if it has ended."""
+    """Return the memory of a process, with its proportional share of shared memory; 0 if it has ended."""
     try:
         smaps = Path(f"/proc/{pid}/smaps_rollup").read_text()
     except OSError:
