@@ -11,7 +11,7 @@ from stereoweave.stereo import Sample, StereoCamera
 
 
 def crop(sample: Sample, height: int, width: int, rng: np.random.Generator) -> Sample:
-    """Crop the sample at a random place, unscaled. Raises StereoweaveError if the crop is larger."""
+    """Crop the sample at a random place without scaling. Raises StereoweaveError if it is too small."""
     rows, columns = sample.disparity_px.shape
     if rows < height or columns < width:
         raise StereoweaveError(

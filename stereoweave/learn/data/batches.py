@@ -57,7 +57,7 @@ class Batches(Dataset[dict[str, torch.Tensor]]):
         return [self.pairs.name(index) for index in self.list_pairs(step)]
 
     def _draw(self, places: int) -> None:
-        """Draw the set of each of the first `places` pairs, and count the earlier draws of that set."""
+        """Draw a set for each of the first `places` pairs, and count the earlier draws of that set."""
         self._drawn = self.mix.draw_sets(places, np.random.default_rng((self.recipe.seed, 0, 0, 1)))
         self._turns = np.zeros(places, np.int64)
         for which in range(len(self.mix.sets)):

@@ -34,7 +34,10 @@ NETWORK_REACH_PX = 188  # largest disparity that a network can find
 
 @dataclass(frozen=True, kw_only=True)
 class CollageCanvas:
-    """The area in which layers are drawn, from the size of the views and the largest disparity in px."""
+    """The area in which layers are drawn.
+
+    Its size follows from the size of the views and the largest disparity of the scene, both in px.
+    """
 
     view_width: int
     height: int

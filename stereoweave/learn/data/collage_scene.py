@@ -11,7 +11,7 @@ from stereoweave.learn.data.silhouettes import Patch
 
 @dataclass(frozen=True, kw_only=True)
 class CollageSurface:
-    """Disparity as a function of left-image x and y: plane, waves and hills, clamped to 0..limit_px.
+    """Disparity as a function of left-image x and y: a sum of plane, waves and hills in 0..limit_px.
 
     Attributes:
         plane: Disparity at the centre, its slopes along x and y, and the centre's x and y.

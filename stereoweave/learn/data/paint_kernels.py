@@ -78,7 +78,7 @@ def draw_stroke_field(
 def sum_surface(
     columns: Float[np.ndarray, "k w"], rows: Float[np.ndarray, "k h"], limit_px: float
 ) -> Float[np.ndarray, "h w"]:
-    """Return a disparity, float32, as the sum of rows[k, y] * columns[k, x], clamped to 0..limit_px."""
+    """Return the disparity, float32: the sum of rows[k, y] * columns[k, x], clamped to 0..limit_px."""
     return _sum_surface(columns, rows, limit_px)
 
 

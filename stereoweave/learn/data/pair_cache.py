@@ -29,7 +29,7 @@ _SOURCES = (
 
 
 class CachedPairs:
-    """The first `count` collage pairs of epoch 0 with a seed, cached in a subfolder of `folder`."""
+    """The first `count` collage pairs of a seed's epoch 0, cached in a subfolder of `folder`."""
 
     def __init__(self, folder: Path, seed: int, count: int, size: tuple[int, int]) -> None:
         self.folder = folder / f"seed{seed}-{size[0]}x{size[1]}-{generator_version()}"

@@ -29,7 +29,7 @@ class Patch:
 
 @dataclass(frozen=True)
 class Placement:
-    """A silhouette's centre and half extent in px, and the canvas that it is clipped to."""
+    """Centre and half extent of a silhouette in px, and the size of the canvas that clips it."""
 
     x: float
     y: float

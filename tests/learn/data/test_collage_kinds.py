@@ -53,7 +53,7 @@ def test_the_range_of_a_narrow_pair_shrinks_with_its_width(draw):
         assert max(layer.surface.over(layer.patch).max(initial=0) for layer in scene.layers) <= 95
 
 
-def test_plain_does_not_mean_far(painted):
+def test_plain_areas_are_not_always_far(painted):
     # A crop of 256x384 pixels, as in training.
     cut = np.s_[32:288, 64:448]
     deep = [far_from_texture(image[cut]) for _, _, image in painted]

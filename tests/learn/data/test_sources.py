@@ -156,7 +156,7 @@ def test_rendered_pairs_of_a_mix_always_get_the_same_camera_imperfections(render
     assert sum(changed) >= 3
 
 
-def test_the_collages_of_a_mix_are_made_like_others(rendered, tmp_path, monkeypatch):
+def test_the_collages_of_a_mix_are_made_like_those_of_other_recipes(rendered, tmp_path, monkeypatch):
     made = []
     monkeypatch.setattr(the_pairs.CachedPairs, "make", lambda pairs, _: iter(made.append(pairs.folder) or []))
     training, _ = open_sources(mixed(rendered, rooms=1.0, collage=1.0), tmp_path)
