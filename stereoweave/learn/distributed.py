@@ -22,7 +22,7 @@ class ProcessRank:
     local_world_size: int = 1
 
     def own_micro_batches(self, count: int) -> range:
-        """Return this rank's share of a step's `count` micro-batches as indices; ranks do not overlap."""
+        """Return this rank's share of a step's `count` micro-batches as indices; shares do not overlap."""
         own = count // self.world_size
         return range(self.rank * own, (self.rank + 1) * own)
 

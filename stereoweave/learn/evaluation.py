@@ -84,9 +84,7 @@ def make_median_method(training: PairSource) -> DisparityMethod:
 def _check_names(names: Sequence[str]) -> None:
     rows = [MEDIAN, *names]
     if twice := [name for name in names if rows.count(name) > 1]:
-        raise StereoweaveError(
-            f"{twice[0]}: expected a unique name of a run other than {MEDIAN!r}; rename it"
-        )
+        raise StereoweaveError(f"{twice[0]}: expected a unique name other than {MEDIAN!r}; rename the run")
 
 
 def _find_common_recipe(networks: dict[str, Checkpoint]) -> Recipe:

@@ -93,14 +93,14 @@ def test_a_constant_disparity_has_the_expected_error(rows):
     assert rows["no warping"].epe_px == 0.75 * 4 + 0.25 * 12
     # The median is that of the training pairs, the wall's 6 px.
     assert rows["median"].epe_px == 0.75 * 2 + 0.25 * 6
-    # Half of 32 px; and with p = 2 its 32 sqrt(0.5) px.
+    # The code 0.5 is half of 32 px, and 32 sqrt(0.5) px with p = 2.
     assert rows["straight"].epe_px == pytest.approx(0.75 * 12 + 0.25 * 4)
     assert rows["half"].epe_px == pytest.approx(0.75 * 18.627417 + 0.25 * 10.627417)
 
 
 @torch.no_grad()
 def disparity_px(name, sample):
-    """The left view's disparity, straight from the network."""
+    """Return the left view's disparity as the network gives it, without the code under test."""
     network = build_network(KEPT[name].recipe)
     network.load_state_dict(KEPT[name].averaged)
     batch = collate([sample])
@@ -136,15 +136,15 @@ def test_the_averaged_weights_are_scored(rng):
     np.testing.assert_allclose(found_px, 32 * np.sqrt(0.5), rtol=1e-6)
 
 
-def test_a_depth_becomes_the_disparity_of_each_pair_s_own_camera():
-    # The code 0.5 is 4 m: 24 / 4 px, and 12 / 4 - 1 px.
+def test_depth_is_converted_to_disparity_by_each_pairs_own_camera():
+    # The code 0.5 is a depth of 4 m, which is 24 / 4 px for one camera and 12 / 4 - 1 px for the other.
     recipe = recipe_of("fast_depth", target="depth", max_depth_m=8.0)
     sample = replace(box_before_a_wall(np.random.default_rng(0)), camera=CAMERA)
     other = replace(sample, camera=replace(CAMERA, focal_px=60.0, doffs_px=1.0))
     match = make_method(kept_of(recipe, answer_half))
     for pair, expected_px in ((sample, 6.0), (other, 2.0)):
         np.testing.assert_allclose(match(pair), np.full(PAIR_SIZE, expected_px), rtol=1e-6)
-    # The wall, 4 px, and the box, 12 px, are 6 m and 2 m away; for the other camera 12 / 5 and 12 / 13 m.
+    # The wall at 4 px and the box at 12 px are 6 m and 2 m away, for the other camera 12 / 5 m and 12 / 13 m.
     errors_m = 2.0, 0.75 * (4 - 12 / 5) + 0.25 * (4 - 12 / 13)
     *_, row = score_projections({"half": match}, [sample, other], recipe.max_depth_m)
     assert row.epe_cm == pytest.approx(100 * np.mean(errors_m), rel=1e-5)
@@ -157,7 +157,7 @@ def test_the_median_ignores_unknown_disparities(rng):
     np.testing.assert_array_equal(match(sample), np.full(PAIR_SIZE, 12.0))
 
 
-def test_runs_with_other_held_out_pairs_are_scored_apart(folder):
+def test_runs_with_different_held_out_pairs_are_refused(folder):
     (folder / "more").mkdir()
     checkpoint.save(kept_of(replace(PAPER, validation_pairs=3)), folder / "more" / "last.pt")
     message = complaint(evaluate, [folder / "random", folder / "more"], folder / "pairs", QUIET)
@@ -168,4 +168,4 @@ def test_runs_with_other_held_out_pairs_are_scored_apart(folder):
 @pytest.mark.parametrize("other", ["elsewhere/random", "median"])
 def test_two_rows_with_the_same_name_are_refused(folder, other):
     message = complaint(evaluate, [folder / "random", folder / other], folder / "pairs", QUIET)
-    assert message.startswith(f"{other.split('/')[-1]}: expected a unique name of a run other than 'median'")
+    assert message.startswith(f"{other.split('/')[-1]}: expected a unique name other than 'median'")

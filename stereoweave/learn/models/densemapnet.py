@@ -39,7 +39,7 @@ _KERAS_NAMES: dict[type[nn.Module], tuple[str, dict[str, str]]] = {
 
 
 class DenseMapNet(nn.Module):
-    """The network that the paper builds on: a disparity code in 0..1 for each pixel of the left view.
+    """The network that the paper builds on, which predicts a disparity code in 0..1 for each left pixel.
 
     290,290 parameters; 8.41 G multiply-adds at 640x480.
 

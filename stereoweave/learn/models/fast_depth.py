@@ -30,7 +30,7 @@ from stereoweave.learn.models.layers import (
 
 
 class FastDepthNet(nn.Module):
-    """The paper's network: a code of depth or disparity in 0..1 for each pixel of the left view.
+    """The paper's network, which predicts a code of depth or disparity in 0..1 for each left pixel.
 
     314,722 parameters; 7.39 G multiply-adds at 640x480.
 

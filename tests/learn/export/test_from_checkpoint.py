@@ -172,7 +172,7 @@ class OneLayer(nn.Module):
         return self.layer(left) @ right[:, :1].mT
 
 
-def test_multiply_adds_are_those_of_layers_and_products():
+def test_multiply_adds_include_layers_and_products():
     height, width = 8, 12
     layer = height * width * 8 * 3 * 9
     product = 8 * height * width * height
