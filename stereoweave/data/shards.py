@@ -153,8 +153,8 @@ class Shards:
             return unpack(files)
         except (ValueError, KeyError, TypeError) as error:  # valid checksums do not prove who wrote the files
             raise FormatError(
-                f"{self._find_shard(index).path}: expected all files of a pair, found {self.name(index)} with "
-                f"missing or damaged ones ({error}); {_DELETE}"
+                f"{self._find_shard(index).path}: expected all files of a pair, found {self.name(index)} "
+                f"with missing or damaged ones ({error}); {_DELETE}"
             ) from error
 
     def _find_shard(self, index: int) -> Shard:
