@@ -20,7 +20,8 @@ pytestmark = pytest.mark.filterwarnings("ignore:Using extra keyword arguments on
 PACKAGE = Path(sw.__file__).parent
 TESTS = Path(__file__).parent
 # Settings that no constant names, by module and expression.
-VARIABLE = {
+VARIABLE: dict[tuple[str, str], set[str]] = {
+    ("errors.py", "error.setting"): set(),  # of an error that another one takes the place of
     ("pictures/pair_finding.py", "side"): {"left", "right"},
     ("rendering/renderer.py", "name"): {"up", "forward"},
     ("synth/sets/make.py", "name"): {"pairs", "seed", "frames"},

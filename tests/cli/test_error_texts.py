@@ -32,9 +32,9 @@ ERRORS = {
     "view plain.png plain.png --rectify -o out.png": "--rectify: expected at least 40 feature matches "
     "that agree on the camera positions, found 0 of 0 matches; take pictures with more texture and "
     "more overlap; or give a calibration (--calib)",
-    "rectify plain.png plain.png -o out": "rectify: expected at least 40 points that both pictures show from "
-    "two positions, found 0 of 0 matches that agree; take pictures with more texture and more overlap; or "
-    "give a calibration (--calib)",
+    "rectify plain.png plain.png -o out": "rectify: expected at least 40 feature matches that agree on the "
+    "camera positions, found 0 of 0 matches; take pictures with more texture and more overlap; or give a "
+    "calibration (--calib)",
     "rectify both.png --format diagonal -o out": f"--format: expected one of {LAYOUTS}, mpo, jps, found "
     "'diagonal'",
     f"depth {PAIR} --write depth.npy -o out": f"depth.npy: {NO_CAMERA}",
@@ -123,6 +123,6 @@ def test_a_folder_with_two_pairs_of_one_name_advises_a_list(capsys):
         (Path("same") / name).write_bytes(b"")
     assert main(["depth", "same", "-o", "out"]) == 2
     assert capsys.readouterr().err == (
-        "stereoweave: expected pairs with different names, found a for a.jps and for a.mpo; rename one; or "
+        "stereoweave: expected pairs with different names, found a for both a.jps and a.mpo; rename one; or "
         "name them in the third column of a list (--list)\n"
     )
