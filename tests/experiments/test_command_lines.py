@@ -13,7 +13,7 @@ from experiments.paper.trials import CLAIMS
 REPOSITORY = Path(__file__).resolve().parents[2]
 RECIPE = REPOSITORY / "recipes" / "weave_small.toml"
 PAPER_RECIPE = REPOSITORY / "recipes" / "paper" / "experiment.toml"
-EXPERIMENTS = "ablations", "paper", "speed", "stage_costs"
+EXPERIMENTS = "ablations", "handheld", "paper", "speed", "stage_costs"
 README = (REPOSITORY / "experiments" / "README.md").read_text(encoding="utf-8")
 
 
@@ -81,7 +81,8 @@ def test_every_experiment_is_a_program_of_its_own():
 def test_the_readme_has_a_command_for_every_experiment():
     commands = re.findall(r"`experiments\.(\w+) (\S+)", README)
     assert {name for name, _ in commands} == set(EXPERIMENTS)
-    assert [file for _, file in commands if not (REPOSITORY / file).is_file()] == []
+    own = [file for _, file in commands if not file.startswith("../shared")]
+    assert [file for file in own if not (REPOSITORY / file).is_file()] == []
 
 
 def test_each_file_that_the_readme_links_to_exists():

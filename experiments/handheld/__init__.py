@@ -1,0 +1,1 @@
+"""Hand-held-like stereo pairs with exact correspondences, to measure how well pairs are aligned."""
