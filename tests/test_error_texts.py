@@ -76,7 +76,7 @@ ERRORS = {
     "position: expected -1.0 to 2.0 (0 left camera, 1 right), got 3": (
         lambda: sw.synthesize(BLACK, BLACK, 3, threads=1)
     ),
-    "expected one kind of video to make, found none; choose one (depth, depth16, position, layout)": VideoJob,
+    "expected one kind of output, found none; choose one (depth, depth16, position, layout)": VideoJob,
     "gpus_each: expected 0, a part of 1 or a whole number, found 1.5": lambda: Engine(gpus_each=1.5),
 }
 

@@ -1,1 +1,1 @@
-"""Stereo videos: reading, converting, writing."""
+"""Reading, conversion and writing of stereo videos."""

@@ -1,4 +1,4 @@
-"""Conversion of a stereo video, frame by frame: match, filter over time, show as depth, view or layout."""
+"""Conversion of a stereo video: matching, temporal filter, and rendering of depth, a view or a layout."""
 
 import hashlib
 from collections.abc import Iterable, Iterator, Sequence
@@ -28,7 +28,7 @@ from stereoweave.video.temporal_filter import TemporalFilter
 from stereoweave.video.tracks import list_picture_files
 from stereoweave.video.writer import GREY16, H264, Packing, Picture, Recorder, check_container
 
-# Length of a part. An interrupted run loses the unfinished one; each begins with a key frame.
+# Length of a part, which begins with a key frame. An interrupted run loses only the unfinished part.
 _PART_S = 10
 _NAMED_PROBLEMS = 3
 
@@ -43,7 +43,7 @@ PACKINGS = {
 
 @dataclass
 class VideoTally:
-    """Counts of frames, cuts and frames with a problem; `named` describes the first problems."""
+    """Numbers of frames, cuts and frames with problems so far, and descriptions of the first problems."""
 
     frames: int = 0
     cuts: int = 0
@@ -51,7 +51,7 @@ class VideoTally:
     named: list[str] = field(default_factory=list)
 
     def add(self, frame: StereoFrame) -> None:
-        """Count a frame."""
+        """Count a frame and its problem, if it has one."""
         self.frames += 1
         if frame.problem is not None:
             self.problems += 1
@@ -62,28 +62,30 @@ class VideoTally:
 def convert_video(
     video: StereoVideo, sources: Sequence[Path], out: Path, job: VideoJob, console: Console
 ) -> VideoTally:
-    """Convert a video and write it; an interrupted conversion resumes after its last finished part.
+    """Convert a video and write the result.
+
+    An interrupted conversion resumes after its last finished part.
 
     Args:
         video: The input video.
-        sources: The input's files; a conversion resumes only if they are unchanged.
-        out: The file to write; its ending chooses the container.
+        sources: Files of the input; a conversion resumes only if they are unchanged.
+        out: Output file, whose ending selects the container.
         job: Settings of the conversion.
-        console: Shows notes on the video, then progress.
+        console: Console for notes on the video and for progress.
 
     Returns:
-        Counts over all runs of this conversion.
+        Counts for the whole conversion, including interrupted runs.
 
     Raises:
-        StereoweaveError: `out` has an unsuitable ending, is in use, or cannot be written, for instance on a
-            full disk.
+        StereoweaveError: `out` has an unsuitable ending, is in use, or cannot be written, for example because
+            the disk is full.
     """
     _check_output(out, job, video, sources)
     matcher = job.backend.matcher()
     recorder = Recorder(
         encoding=GREY16 if job.depth16 else H264,
         time_base=video.time_base,
-        # FFmpeg's fractions have 32 bits.
+        # FFmpeg stores the terms of a fraction in 32 bits.
         rate=video.rate.limit_denominator(100_000),
         packing=PACKINGS.get(job.layout or ""),
         threads=thread_count(job.backend.threads),
@@ -113,7 +115,7 @@ def convert_video(
 
 
 class _FrameConverter:
-    """Makes the output image of each frame; its state can be saved and restored."""
+    """Converter of frames to output images, with a state that can be saved and restored."""
 
     def __init__(self, job: VideoJob, matcher: Matcher, survey: Survey) -> None:
         self.survey, self.tally = survey, VideoTally()
@@ -122,7 +124,7 @@ class _FrameConverter:
 
     @classmethod
     def from_state(cls, job: VideoJob, matcher: Matcher, state: dict[str, np.ndarray]) -> "_FrameConverter":
-        """Restore a converter from its `state`; it continues exactly as the original would have."""
+        """Restore a converter from a saved `state`. It continues exactly as the original would have."""
         low_px, high_px, middle_px, *match_range_px = state.pop("survey_px").tolist()
         survey = Survey(
             (low_px, high_px), middle_px, (match_range_px[0], match_range_px[1]) if match_range_px else None
@@ -134,7 +136,7 @@ class _FrameConverter:
         return converter
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return everything that the next frame's output depends on, as arrays."""
+        """Return the state as arrays: everything that affects the output of later frames."""
         tally = self.tally
         return {
             "survey_px": np.array(
@@ -148,7 +150,7 @@ class _FrameConverter:
     def convert(
         self, frames: Iterable[StereoFrame], bar: Progress, shown: TaskID
     ) -> Iterator[tuple[Fraction, Picture]]:
-        """Yield each frame's time and output image; updates the progress bar."""
+        """Yield the time in seconds and the output image of each frame, and update the progress bar."""
         for frame in frames:
             pair = StereoPair(left=frame.left, right=frame.right)
             estimate = match(self._matcher, pair, self._options)
@@ -161,15 +163,17 @@ class _FrameConverter:
 
 def _check_output(out: Path, job: VideoJob, video: StereoVideo, sources: Sequence[Path]) -> None:
     if job.depth16 and out.suffix.lower() != ".mkv":
-        raise StereoweaveError(f"{out}: expected the ending .mkv for depth in 16 bits, found {out.suffix!r}")
+        raise StereoweaveError(
+            f"{out}: expected a file name ending in .mkv for 16-bit depth, found {out.suffix!r}"
+        )
     for source in sources:
         if source.exists() and out.exists() and out.samefile(source):
-            raise StereoweaveError(f"{out}: expected another file than the input video")
+            raise StereoweaveError(f"{out}: expected an output other than the input, found the same file")
     check_container(out, video.sound)
 
 
 def _list_settings(job: VideoJob, video: StereoVideo, sources: Sequence[Path]) -> dict[str, object]:
-    """Return everything that determines the video except the machine, by setting, as JSON values."""
+    """Return the inputs and settings that determine the output on a given machine, as JSON values by name."""
     model = Path(job.backend.model)
     return {
         "depth": job.depth,
@@ -187,7 +191,7 @@ def _list_settings(job: VideoJob, video: StereoVideo, sources: Sequence[Path]) -
 
 
 def _identify_source(path: Path) -> list[object]:
-    """Return a path's name, and a digest of its files' names, sizes and modification times."""
+    """Return a path and a digest of the names, sizes and modification times of its files."""
     files = list_picture_files(path)
     digest = hashlib.sha256()
     for file in [path] if files is None else files:

@@ -1,4 +1,4 @@
-"""Settings of a conversion: what is made of each frame, and what the file then holds."""
+"""Settings of a video conversion, and the rendering of its output frames."""
 
 from dataclasses import dataclass
 from math import isfinite
@@ -17,24 +17,25 @@ from stereoweave.video.writer import Picture
 
 _STEPS_PER_PX, _MOST_GREY16_PX = 256, 255.99
 
-# Keys of the saved settings that are not settings, and their names in errors.
+# Keys of the saved settings that identify the input and the version, and their names in errors.
 _SAVED_FACTS = {"film": "video", "stereoweave": "stereoweave"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class VideoJob:
-    """Settings of a conversion; exactly one of depth, depth16, position and layout is set.
+    """Settings of a video conversion. Exactly one of depth, depth16, position and layout must be set.
 
     Attributes:
-        depth: Left disparity in colours, with one range for the whole video.
-        depth16: Left disparity as 16-bit grey, px * 256 as in disparity.png; clipped to 1/256 to 255.99 px.
-        position: View from this position: 0 is the left camera, 1 the right one.
-        layout: A name in `LAYOUTS`.
-        strength: Multiplies the baseline.
-        convergence_px: Disparity that stays in place from view to view. Default: the scene's median disparity
-            for layouts that overlay their views, else 0.
-        backend: Matches the frames.
-        name_of: The front end's names for settings, used in notes.
+        depth: Output the left disparity in colour, with one range for the whole video.
+        depth16: Output the left disparity as 16-bit grey, px * 256 as in disparity.png. Values are clipped to
+            the range from 1/256 to 255.99 px.
+        position: Output the view from this position: 0 is the left camera, 1 the right one.
+        layout: Output the layout of this name in `LAYOUTS`.
+        strength: Factor by which the baseline is multiplied.
+        convergence_px: Disparity of the points that stay in the same column in all views. Default: the median
+            disparity of the scene for layouts that overlay their views, else 0.
+        backend: Backend that matches the frames.
+        name_of: Function that returns the front end's name for a setting, used in notes.
     """
 
     depth: bool = False
@@ -56,7 +57,7 @@ class VideoJob:
         given = [kind for kind, is_given in kinds.items() if is_given]
         if len(given) != 1:
             raise StereoweaveError(
-                f"expected one kind of video to make, found {' and '.join(given) or 'none'}",
+                f"expected one kind of output, found {' and '.join(given) or 'none'}",
                 remedy=Remedy("choose one", tuple(kinds)),
             )
         if self.layout not in (None, *LAYOUTS):
@@ -67,7 +68,7 @@ class VideoJob:
         check_positions(self._positions, self.strength)
 
     def _check_numbers(self, kind: str) -> None:
-        """Raise if a number is not finite, or has no effect on this kind of video."""
+        """Raise StereoweaveError if a number is not finite, or has no effect on this kind of output."""
         numbers = {"strength": (self.strength, 1.0), "convergence_px": (self.convergence_px, None)}
         for setting, (value, unset) in numbers.items():
             if value == unset or value is None:
@@ -76,7 +77,7 @@ class VideoJob:
                 raise StereoweaveError(f"expected a finite number, found {value}", setting=setting)
             if not self._positions:
                 raise StereoweaveError(
-                    f"expected a view or a layout of views for it, found {kind}", setting=setting
+                    f"expected a view or a layout of views as output, found {kind}", setting=setting
                 )
 
     @property
@@ -86,7 +87,7 @@ class VideoJob:
         return () if self.position is None else (self.position,)
 
     def render_frame(self, pair: StereoPair, estimate: Estimate, survey: Survey) -> Picture:
-        """Make the output image of one frame."""
+        """Render the output image of one frame."""
         if self.depth:
             return colour_disparity(estimate.disparity_px, survey.range_px)
         if self.depth16:
@@ -103,7 +104,7 @@ class VideoJob:
         return LAYOUTS[str(self.layout)].compose(renderer, LayoutOptions(range_px=survey.range_px))
 
     def _find_plane_px(self, survey: Survey) -> float:
-        """Return the disparity that stays in place from view to view."""
+        """Return the disparity of the points that stay in the same column in all views."""
         if self.convergence_px is not None:
             return self.convergence_px
         return survey.middle_px if self.layout and LAYOUTS[self.layout].converged else 0.0
@@ -116,18 +117,18 @@ class VideoJob:
         return self.name_of(setting) or setting
 
     def find_losses(self, survey: Survey) -> list[Note]:
-        """Return a note if the file cannot hold all of the video's disparities."""
+        """Return a note if the output format cannot represent all disparities of the video."""
         low_px, high_px = survey.range_px
         if not self.depth16 or (low_px >= 0 and high_px <= _MOST_GREY16_PX):
             return []
         text = (
-            f"16-bit grey holds 0 to {_MOST_GREY16_PX} px: this video's disparities, {low_px:.1f} to "
-            f"{high_px:.1f} px, are clipped"
+            f"16-bit grey covers 0 to {_MOST_GREY16_PX} px; this video's disparities of {low_px:.1f} to "
+            f"{high_px:.1f} px are clipped"
         )
         return [Note(text, Remedy("show all of them in colours", ("depth",)))]
 
     def describe_values(self, survey: Survey) -> dict[str, str]:
-        """Return the file's metadata: how to convert its pictures back to disparities."""
+        """Return the metadata of the output file, which explains how its pixel values encode disparity."""
         low_px, high_px = survey.range_px
         if self.depth16:
             return {"comment": f"16-bit grey: disparity of the left view in pixels = value / {_STEPS_PER_PX}"}
@@ -141,5 +142,5 @@ class VideoJob:
 
 
 def _encode_grey16(disparity_px: Float[np.ndarray, "h w"]) -> UInt16[np.ndarray, "h w"]:
-    # 0 would mean unknown, as in disparity.png.
+    # The value 0 is reserved for unknown, as in disparity.png.
     return np.clip(np.rint(_STEPS_PER_PX * disparity_px), 1, 65535).astype(np.uint16)

@@ -1,4 +1,4 @@
-"""The parts of an unfinished video on disk, from which an interrupted conversion resumes."""
+"""Parts of an unfinished video on disk, from which an interrupted conversion resumes."""
 
 import json
 from collections.abc import Callable, Iterator, Mapping
@@ -15,22 +15,22 @@ from stereoweave.io.files import make_folder, remove_leftovers, replacing
 
 
 class Parts:
-    """The finished parts of a video, and the state after the last one.
+    """Finished parts of a video, and the state of the conversion after the last part.
 
     Attributes:
-        folder: The folder of the parts.
-        files: The finished parts, in order.
+        folder: Folder that contains the parts.
+        files: Paths of the finished parts, in order.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.files = sorted(folder.glob("[0-9]*.nut"))
-        if not self._state_file(len(self.files)).exists():  # an interrupted removal deletes the state first
+        if not self._state_file(len(self.files)).exists():  # `_clear` was interrupted
             self.files = []
 
     @contextmanager
     def next(self, state: Callable[[], Mapping[str, np.ndarray]]) -> Iterator[Path]:
-        """Give a path for the next part; the part is finished once the state after it is saved too."""
+        """Provide a path for the next part, which counts as finished once the state after it is saved too."""
         number = len(self.files) + 1
         part = self.folder / f"{number:06}.nut"
         with replacing(part) as temporary:
@@ -51,22 +51,24 @@ class Parts:
 
 
 def parts_folder(out: Path) -> Path:
-    """Return the folder of a video's unfinished parts."""
+    """Return the folder for the parts of an unfinished video."""
     return out.with_name(f"{out.name}.parts")
 
 
 @contextmanager
 def open_parts(out: Path, settings: Mapping[str, object], name_of: NameOf = keyword) -> Iterator[Parts]:
-    """Open the parts of a video, to add more; removes them on success and keeps finished ones after an error.
+    """Open the parts of a video so that more can be added.
+
+    On success, all parts are removed. After an error, the finished parts are kept.
 
     Args:
         out: The video that the parts will become.
-        settings: Its input and settings, as JSON values.
-        name_of: The front end's names for these settings, used in errors.
+        settings: Input and settings of the conversion, as JSON values.
+        name_of: Function that returns the front end's name for a setting, used in errors.
 
     Raises:
-        StereoweaveError: The folder has parts with other settings or damaged ones; or an error of the body,
-            with a note that finished parts are kept.
+        StereoweaveError: The folder contains damaged parts, or parts made with other settings. Also raised
+            for an error in the body after a part was finished, with a note on how to resume.
     """
     folder = parts_folder(out)
     parts = Parts(folder)
@@ -114,8 +116,8 @@ def _check_settings(folder: Path, settings: Mapping[str, object], name_of: NameO
     if other:
         begun = ", ".join(_format_setting(name_of(name) or name, found.get(name)) for name in other)
         raise StereoweaveError(
-            f"{folder}: expected parts of the same video, found parts begun {begun}; "
-            "remove that folder, or give the same settings again"
+            f"{folder}: expected parts of the same video, found parts made {begun}; "
+            "remove this folder, or rerun with the same settings"
         )
 
 
@@ -133,11 +135,11 @@ def _format_setting(name: str, value: object) -> str:
 
 @contextmanager
 def _reporting_damage(file: Path) -> Iterator[None]:
-    """Turn any error of reading a file of the parts into one line."""
+    """Convert any error from reading a file in the folder of parts to a one-line StereoweaveError."""
     try:
         yield
     except (OSError, ValueError, TypeError, EOFError, BadZipFile) as error:
         raise StereoweaveError(
-            f"{file}: expected the saved state of an interrupted video, found none that can be read; "
+            f"{file}: expected the saved state of an interrupted video, found no readable file; "
             f"remove the folder {file.parent}"
         ) from error

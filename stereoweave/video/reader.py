@@ -1,4 +1,4 @@
-"""Reading of stereo video: pairs of frames with their times, for any frame packing."""
+"""Reading of stereo videos as pairs of frames with times, for all supported frame packings."""
 
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
@@ -17,16 +17,17 @@ _REPEATED_LAST, _REPEATED_NEXT = (
     "damaged: replaced by the frame after it",
 )
 _AFTER_DAMAGE = "decoded from a damaged frame before it"
-_RETIMED = "its time stamp was missing or a duplicate: it is shown slightly later"
+_RETIMED = "its time stamp was missing or a duplicate, so it is shown slightly later"
 
 
 class StereoFrame(NamedTuple):
-    """One pair of frames of a video.
+    """Pair of frames of a video.
 
     Attributes:
         left, right: uint8 RGB [H, W, 3].
-        time: Exact time in seconds from the start of the video.
-        problem: Why this frame is not the original one, or why the video ends early; None if intact.
+        time: Exact time since the start of the video, in seconds.
+        problem: Description of damage to this frame, of a changed time stamp, or of an early end of the
+            video; None if there is no problem.
     """
 
     left: UInt8[np.ndarray, "h w 3"]
@@ -36,20 +37,21 @@ class StereoFrame(NamedTuple):
 
 
 class StereoVideo:
-    """A stereo video: pairs of frames with their times; opened by `open_video`.
+    """Stereo video that yields pairs of frames with their times; opened by `open_video`.
 
     Attributes:
-        name: The files, as the caller gave them.
-        frame_packing: How a frame holds both eyes, a name in `PAIR_LAYOUTS`; None for two files.
-        size_px: Width and height of one eye at full size.
-        frame_count: Number of frames that `frames` yields: one for each in the file, damaged or not.
+        name: Paths of the files, as given by the caller.
+        frame_packing: Frame packing, a name in `PAIR_LAYOUTS`; None for two files.
+        size_px: Width and height of each eye's image at full size.
+        frame_count: Number of frames that `frames` yields, including damaged ones. If two files differ, the
+            lower number counts.
         rate: Average frames per second.
-        time_base: Unit of all times, in seconds; every time is a multiple of it.
-        sound: The file that has the video's sound, if any.
+        time_base: Time unit in seconds, of which every frame time is a multiple.
+        sound: File that contains the sound; None for a silent video.
     """
 
     def __init__(self, tracks: Sequence[Track], frame_packing: str | None) -> None:
-        """Combine two tracks, or split one that has both eyes in each frame."""
+        """Combine a left and a right track, or split one track with both eyes in each frame."""
         self._tracks = tracks
         self._split = PAIR_LAYOUTS[frame_packing] if frame_packing else None
         first = tracks[0]
@@ -61,10 +63,11 @@ class StereoVideo:
         self.sound = next((track.sound for track in tracks if track.sound), None)
 
     def frames(self, start: int = 0) -> Iterator[StereoFrame]:
-        """Yield the frames from number `start` on, identical to those of a run from 0.
+        """Yield the frames from number `start` on, identical to those that a run from 0 yields.
 
-        A frame that cannot be decoded is replaced by the last decoded one. Frames decoded from a damaged one,
-        up to the next key frame, are yielded unchanged. `problem` reports both.
+        A frame that cannot be decoded is replaced by the last decoded frame. The frames that depend on it,
+        up to the next key frame, are yielded as decoded. The `problem` of a frame describes either
+        case.
         """
         steps = self._tracks[0].steps
         every_track = zip(*(_bridge_gaps(track, start) for track in self._tracks), strict=False)
@@ -90,25 +93,27 @@ class StereoVideo:
 
     def _describe_ending(self, track: Track) -> str | None:
         more = len(track.steps) - self.frame_count
-        frames = "1 frame" if more == 1 else f"{more} frames"
-        return f"{track.name} has {frames} more than the other video" if more else track.truncation
+        frames = "1 more frame" if more == 1 else f"{more} more frames"
+        return f"{track.name} has {frames} than the other video" if more else track.truncation
 
 
 def open_video(
     paths: Sequence[Path], format: str | None = None, *, rate: Fraction | None = None
 ) -> StereoVideo:
-    """Open a stereo video: one file with both eyes, or two, left and right.
+    """Open a stereo video from one file with both eyes, or from a left and a right file.
 
-    Reads the files once for every frame's time, and decodes some frames to detect the frame packing.
+    Reads each file once to find the times of all frames, and decodes some frames to detect the frame packing.
 
     Args:
-        paths: One or two videos, folders of pictures, or glob patterns of pictures.
-        format: How one frame holds both eyes, a name in `PAIR_LAYOUTS`. Default: detected.
-        rate: Frames per second of pictures; default: 25.
+        paths: One or two videos, folders of pictures, or glob patterns that match pictures.
+        format: Frame packing of a single video, a name in `PAIR_LAYOUTS`. Default: detected.
+        rate: Frame rate for pictures, in frames per second. Default: 25.
 
     Raises:
-        FormatError: A file cannot be read or halved, is not 3-D, or does not match the other one.
-        StereoweaveError: Unknown frame packing, not one or two paths, a rate for a video, or PyAV is missing.
+        FormatError: A file cannot be read, is not 3-D, does not match the other file, or has frames that
+            cannot be halved.
+        StereoweaveError: The frame packing is unknown, the number of paths is not one or two, a rate is given
+            for a video, or PyAV is missing.
     """
     if format not in (None, *PAIR_LAYOUTS):
         raise StereoweaveError(
@@ -116,7 +121,7 @@ def open_video(
         )
     if not 1 <= len(paths) <= 2 or (len(paths) == 2 and format):
         raise StereoweaveError(
-            "expected one video with both eyes, or two, left and right, without a frame packing, "
+            "expected one video with both eyes, or a left and a right video without a frame packing, "
             f"found {len(paths)}: {' '.join(map(str, paths))}"
         )
     tracks = [open_track(path, rate) for path in paths]
@@ -132,25 +137,25 @@ def open_video(
 
 
 def _check_alike(left: Track, right: Track) -> None:
-    """Raise unless both videos have one size and their frames stay within half a frame of each other."""
+    """Raise FormatError unless both videos have the same size and stay in sync to within half a frame."""
     if left.size_px != right.size_px:
         sizes = ["{}x{}".format(*track.size_px) for track in (left, right)]
         raise FormatError(
-            f"expected left and right videos of one size, found {left.name} of {sizes[0]} "
-            f"and {right.name} of {sizes[1]}; scale one of them first"
+            f"expected left and right videos of the same size, found {left.name} with {sizes[0]} "
+            f"and {right.name} with {sizes[1]} pixels; scale one of them first"
         )
     last = min(len(left.steps), len(right.steps)) - 1
     ends_s = [(track.steps[last] - track.steps[0]) * track.time_base for track in (left, right)]
     if abs(ends_s[0] - ends_s[1]) > Fraction(1, 2) / left.rate:
         raise FormatError(
-            f"expected left and right videos of one frame rate, found frame {last} of {left.name} "
-            f"at {float(ends_s[0]):.3f} s and of {right.name} at {float(ends_s[1]):.3f} s; "
-            "bring both to one rate first"
+            f"expected left and right videos with the same frame rate, found frame {last} at "
+            f"{float(ends_s[0]):.3f} s in {left.name} and at {float(ends_s[1]):.3f} s in {right.name}; "
+            "convert one of them first"
         )
 
 
 def _bridge_gaps(track: Track, start: int) -> Iterator[tuple[Shot, str | None]]:
-    """Yield a shot and its problem for each frame from number `start` on; replaces missing frames."""
+    """Yield a shot and its problem, if any, for each frame from number `start` on; replace missing frames."""
     upcoming, last, after_damage = 0, None, False
     for shot in track.shots(start):
         index = shot.number
@@ -171,6 +176,6 @@ def _bridge_gaps(track: Track, start: int) -> Iterator[tuple[Shot, str | None]]:
 
 
 def format_time(time_s: Fraction) -> str:
-    """Format a time: 0:01:02.345 for 62.345 s."""
+    """Return a time in hours, minutes and seconds, for example 0:01:02.345 for 62.345 s."""
     minutes, seconds = divmod(float(time_s), 60)
     return f"{int(minutes) // 60}:{int(minutes) % 60:02}:{seconds:06.3f}"

@@ -1,4 +1,4 @@
-"""Survey of a video before its conversion: disparities and defects of frames spread over all of it."""
+"""Survey of a video before its conversion: disparities and defects of frames from the whole video."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -23,15 +23,15 @@ from stereoweave.video.reader import StereoVideo, format_time
 
 _SURVEYED_FRAMES, _CHECKED_FRAMES = 24, 3
 _SURVEY_STEP_PX = 4
-# Outliers do not widen the range; the margin allows for objects that come nearer between the surveyed frames.
+# The percentiles exclude outliers. The margin allows for objects that come nearer between surveyed frames.
 _OUTER_PERCENT, _MARGIN_PX = 0.5, 8.0
 
 
 class Survey(NamedTuple):
-    """Disparities measured in frames from all over the video.
+    """Disparity statistics of frames spread over the whole video.
 
     Attributes:
-        range_px: Disparity range of the colours.
+        range_px: Disparity range that the colours represent.
         middle_px: Median disparity of the scene.
         match_range_px: Disparity range to match; None if the network's own range covers the surveyed frames.
     """
@@ -42,9 +42,9 @@ class Survey(NamedTuple):
 
 
 def survey_video(video: StereoVideo, matcher: Matcher, bar: Progress) -> tuple[Survey, list[Note]]:
-    """Survey the disparities of frames spread over the whole video, and find defects.
+    """Measure the disparities of frames spread over the whole video, and find defects.
 
-    The frames are spread because the first ones may be titles, which have another range.
+    The first frames alone are not enough, because they may be titles with a different disparity range.
     """
     picked = _spread_evenly(video.frame_count, _SURVEYED_FRAMES)
     checked = set(picked[len(picked) // 6 :: -(-len(picked) // _CHECKED_FRAMES)])
@@ -69,22 +69,25 @@ def survey_video(video: StereoVideo, matcher: Matcher, bar: Progress) -> tuple[S
 def _find_match_range_px(
     disparity_px: Float[np.ndarray, "h w"], matcher: Matcher
 ) -> tuple[float, float] | None:
-    """Return the disparity range of surveyed disparities; None if the network's own range covers it."""
+    """Return the disparity range to match; None if the network's own range covers all disparities."""
     low_px, high_px = np.percentile(disparity_px, [_OUTER_PERCENT, 100 - _OUTER_PERCENT]).tolist()
     if low_px >= 0 and high_px <= matcher.max_disparity_px:
         return None
-    # A plain sky is matched at the lower end of the range: for parallel cameras that stays at 0.
+    # A plain sky is matched at the lower end of the range, which stays at 0 for parallel cameras.
     return min(low_px, max(low_px - _MARGIN_PX, 0.0)), high_px + _MARGIN_PX
 
 
 def _spread_evenly(count: int, wanted: int) -> range:
-    """Return the numbers of at most `wanted` frames, evenly spread over `count`."""
+    """Return the numbers of at most `wanted` frames, spread evenly over `count` frames."""
     step = -(-count // wanted)
     return range(step // 2, count, step)
 
 
 def _add_time(time: Fraction, note: Note, video: StereoVideo) -> Note:
-    """Add the time to a note; for swapped views in one file, the remedy becomes the other frame packing."""
+    """Return a note with the time of its frame added.
+
+    For swapped views in one file, the remedy becomes the frame packing with the eyes swapped.
+    """
     other = _find_swapped_packing(video.frame_packing)
     if note == SWAPPED and other:
         note = replace(note, remedy=Remedy(f"choose {other}", ("format",)))
@@ -92,13 +95,16 @@ def _add_time(time: Fraction, note: Note, video: StereoVideo) -> Note:
 
 
 def _select_common_notes(defects: Sequence[list[Note]]) -> list[Note]:
-    """Return the notes on the last frame that has any, if at least half do: a video may begin black."""
+    """Return the notes on the last frame with any, if at least half of the frames have notes.
+
+    Notes on fewer frames are unreliable, because a video may begin with black frames.
+    """
     some = [notes for notes in defects if notes]
     return some[-1] if 2 * len(some) > len(defects) else []
 
 
 def _find_swapped_packing(frame_packing: str | None) -> str | None:
-    """Return the named frame packing with the eyes swapped, if any."""
+    """Return the name of the frame packing with the eyes swapped, or None if there is none."""
     if frame_packing is None:
         return None
     split = PAIR_LAYOUTS[frame_packing]

@@ -1,10 +1,12 @@
-"""Temporal filter: averages a video's disparity along its motion, and restarts at each cut.
+"""Temporal filter that averages the disparity of a video along its motion and restarts at each cut.
 
-Each view is filtered separately. The previous estimate is warped along the optical flow. A change that a
-surface's neighbourhood shares is taken for a true change of its distance, and the rest for noise: each pixel
-becomes the mean over the frames that saw its point. A pixel restarts where the previous frame does not
-explain the image, and where the new disparity contradicts the old one: at once near anything that moves in
-either view, by vote where everything is at rest. So nothing trails behind moving objects.
+Each view is filtered separately. The previous estimate is warped along the optical flow. A change in
+disparity that a pixel shares with its neighbourhood is treated as a true change in distance, and the rest as
+noise. Each pixel becomes the mean over the frames that saw its point.
+
+A pixel restarts if the previous frame does not explain the image, or if the new disparity contradicts the old
+one: immediately near anything that moves in either view, and by majority vote where everything is at rest.
+Moving objects therefore leave no trail.
 """
 
 import typing
@@ -21,35 +23,37 @@ from stereoweave.system.jit import kernel
 from stereoweave.system.threads import thread_count
 
 MOST_FRAMES = 12.0
-"""Most frames that count in a mean, so that slow changes are followed soon."""
+"""Maximum number of frames in a mean. The limit lets the mean follow slow changes."""
 SAME_PX, SAME_SHARE = 1.0, 0.02
-"""Two frames see the same surface if their disparities differ by at most this, plus this share of them."""
+"""Two frames see the same surface if their disparities differ by at most SAME_PX + SAME_SHARE * disparity."""
 NEIGHBOUR_PX = 3.0
-"""Neighbours whose disparities differ by less than this belong to the same surface."""
+"""Neighbours belong to the same surface if their disparities differ by less than this."""
 STEP_PX, STEPS = 8, 2
-"""Grid of the sampled neighbours: its step, and the number of steps to each side."""
+"""Spacing of the grid of sampled neighbours, and the number of steps in each direction."""
 
-# At half the size, where noise is half as strong and optical flow takes a quarter of the time.
+# In pixels at half size, where noise is half as strong and optical flow takes a quarter of the time.
 _WINDOW_PX = 5
-# A window is explained if its mean difference is below this multiple of the image's median difference, its
-# noise, plus an offset for clean images. Noise is at most the third number.
+# A window is explained if its mean difference is at most this multiple of the median difference, which
+# measures the noise of the image, plus an offset for clean images. The third number limits the noise.
 _EXPLAINED, _LEAST_LEVELS, _NOISIEST_LEVELS = 1.5, 0.5, 6.0
 # Motion always explains a little more than rest, because it also fits the noise.
 _REST, _REST_LEVELS = 1.1, 0.25
 # A pixel is calm if nothing moves in the window of this size around it.
 _CALM_PX = 9
-# Zero on a plane. Normal noise of one level gives a deviation of 6 levels, and a median of 0.674 times that.
+# This filter is zero on a plane. Gaussian noise with a standard deviation of one level gives a standard
+# deviation of 6 levels, and a median absolute value of 0.674 * 6 levels.
 _ROUGHNESS = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
 _MEDIAN_ROUGHNESS = 6 * 0.674
-# A window has contrast if its standard deviation exceeds this multiple of the noise's, plus a level.
+# A window has contrast if its standard deviation exceeds this multiple of the noise level plus an offset.
 _CONTRAST, _CONTRAST_LEVELS = 2.0, 1.0
 # A window that differs by more than this share of its contrast shows something else, however faint.
 _DIFFERENT_SHARE = 0.6
-# In rendered videos the previous frame explains over 0.4 of the contrast; across scenes, less than 0.1.
+# In rendered videos, the previous frame explains over 0.4 of the windows with contrast, and less than 0.1 of
+# them across a cut.
 _CUT_SHARE = 0.2
-# Contrast in less than this share of an image is a single object, which may appear without a cut.
+# Contrast in less than this share of an image may be a single object that appears without a cut.
 _LEAST_CONTRAST_SHARE = 0.05
-# With this share of the image at rest, a majority of contradictions is not chance.
+# If at least this share of the image is at rest, a majority of contradictions cannot be due to chance.
 _LEAST_ASKED_SHARE = 0.25
 
 
@@ -59,7 +63,7 @@ class Track(typing.NamedTuple):
     Attributes:
         disparity_px: Mean disparity over the frames.
         confidence: Mean confidence; a frame that contradicts the mean counts as 0.
-        frames: Number of frames in the mean, less those that have contradicted it since; 0 if unknown.
+        frames: Number of frames in the mean, minus those that have contradicted it since; 0 where unknown.
     """
 
     disparity_px: np.ndarray
@@ -68,14 +72,15 @@ class Track(typing.NamedTuple):
 
 
 class Motion(typing.NamedTuple):
-    """Motion from an image back to the previous one; arrays have half its size, rounded up.
+    """Motion from an image back to the previous image; arrays have half the image size, rounded up.
 
     Attributes:
-        to_before_px: float32 [H2, W2, 2], from a pixel to its point in the previous image, in full-size
-            pixels.
-        explained: bool, true where the previous image looks the same at that point.
+        to_before_px: float32 [H2, W2, 2], offset from a pixel to its position in the previous image, in
+            full-size pixels.
+        explained: bool, true where the previous image looks the same at that position.
         calm: bool, true where nothing moves nearby.
-        explained_share: Explained share of the windows with contrast; 1 if next to nothing has contrast.
+        explained_share: Share of the windows with contrast that are explained; 1 if almost no window has
+            contrast.
     """
 
     to_before_px: np.ndarray
@@ -85,12 +90,12 @@ class Motion(typing.NamedTuple):
 
 
 class Expectation(typing.NamedTuple):
-    """Prediction of a view from the previous frames; the last two arrays have half its size.
+    """Prediction of a view from the previous frames; `calm` and `drift_px` have half the image size.
 
     Attributes:
-        carried: The track warped to the new frame.
+        carried: Track warped to the new frame.
         calm: bool, true where nothing moves near the pixel or near its match in the other view.
-        drift_px: float32, change of the surface's disparity.
+        drift_px: float32, disparity change of the surface since the previous frame.
     """
 
     carried: Track
@@ -99,10 +104,10 @@ class Expectation(typing.NamedTuple):
 
 
 class TemporalFilter:
-    """Filters a video's estimates, frame by frame, with those before.
+    """Filter that averages the estimates of a video over time, frame by frame.
 
     Args:
-        threads: Default: all cores; uses at most two, one per view.
+        threads: Number of threads; at most two are used, one per view. Default: all cores.
 
     Attributes:
         cuts: Number of cuts so far.
@@ -120,20 +125,20 @@ class TemporalFilter:
     def __call__(
         self, left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"], estimate: Estimate
     ) -> Estimate:
-        """Filter the estimate of the next frame; unchanged after a cut.
+        """Return the filtered estimate of the next frame; after a cut, the estimate is unchanged.
 
         Args:
             left: uint8 RGB [H, W, 3].
-            right: The same size as the left image.
-            estimate: The pair's estimate.
+            right: Right image of the same size.
+            estimate: Estimate of the pair.
 
         Returns:
-            The estimate with both disparities and the confidence filtered; `occluded` is not.
+            Estimate with both disparities and the confidence filtered, and `occluded` unchanged.
         """
         if left.shape != right.shape or left.shape[:2] != estimate.disparity_px.shape:
             raise StereoweaveError(
-                f"estimate: expected the size of both pictures, got {list(estimate.disparity_px.shape)} for "
-                f"{list(left.shape[:2])} and {list(right.shape[:2])}; estimate these two"
+                f"estimate: expected the size of both images, found {list(estimate.disparity_px.shape)} for "
+                f"{list(left.shape[:2])} and {list(right.shape[:2])}; pass the estimate of this pair"
             )
         before, self._greys = self._greys, [_convert_to_grey(left), _convert_to_grey(right)]
         # The right view has no confidence; the placeholder is not returned.
@@ -155,7 +160,7 @@ class TemporalFilter:
         )
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return everything needed to continue exactly, as arrays for `np.savez`."""
+        """Return the complete state as arrays for `np.savez`; a restored filter continues exactly."""
         kept = {"cuts": np.array(self.cuts)}
         for side, grey, track in zip(("left", "right"), self._greys, self._tracks, strict=False):
             kept[f"{side}_grey"] = grey
@@ -164,7 +169,7 @@ class TemporalFilter:
 
     @classmethod
     def from_state(cls, state: Mapping[str, np.ndarray], threads: int | None = None) -> "TemporalFilter":
-        """Restore a filter from its `state`."""
+        """Restore a filter from a saved `state`."""
         temporal_filter = cls(threads)
         temporal_filter.cuts = int(state["cuts"])
         for side in ("left", "right") if "left_grey" in state else ():
@@ -173,14 +178,14 @@ class TemporalFilter:
         return temporal_filter
 
     def _filter_tracks(self, before: list[np.ndarray], new_tracks: list[Track]) -> list[Track] | None:
-        """Filter the new tracks with the previous ones; None after a cut."""
+        """Return the new tracks filtered with the previous ones, or None after a cut."""
         if new_tracks[0].frames.shape != self._tracks[0].frames.shape:
             return None
         with ThreadPoolExecutor(self._threads) as pool:
             motions = list(pool.map(_measure_motion, before, self._greys))
             if np.mean([motion.explained_share for motion in motions]) < _CUT_SHARE:
                 return None
-            # A left pixel's match in the right view is to the left, a right pixel's to the right.
+            # The match of a pixel is further left in the right view, and further right in the left view.
             expected = list(pool.map(_predict, self._tracks, new_tracks, motions, motions[::-1], (-1, 1)))
             if _is_contradicted(new_tracks, expected):
                 return None
@@ -188,14 +193,14 @@ class TemporalFilter:
 
 
 def _convert_to_grey(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2"]:
-    """Convert to grey at half the size, rounded up."""
+    """Convert an image to grey at half the size, rounded up."""
     height, width = image.shape[:2]
     half = ((width + 1) // 2, (height + 1) // 2)
     return cv2.resize(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), half, interpolation=cv2.INTER_AREA)
 
 
 def _measure_motion(before: UInt8[np.ndarray, "h2 w2"], grey: UInt8[np.ndarray, "h2 w2"]) -> Motion:
-    """Measure the motion between two grey images of half the size."""
+    """Measure the motion from a grey image back to the previous one, both at half size."""
     before = _match_brightness(before, grey)
     rest = np.zeros((*grey.shape, 2), np.float32)
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST).calc(grey, before, rest)
@@ -216,7 +221,7 @@ def _measure_explained_share(
     least_levels: Float[np.ndarray, "h2 w2"],
     explained: Bool[np.ndarray, "h2 w2"],
 ) -> float:
-    """Return the explained share of the windows with contrast; 1 if next to nothing has contrast."""
+    """Return the share of windows with contrast that are explained; 1 if almost no window has contrast."""
     window = (_WINDOW_PX, _WINDOW_PX)
     squares = cv2.sqrBoxFilter(grey, cv2.CV_32F, window)
     variance = squares - cv2.boxFilter(grey, cv2.CV_32F, window) ** 2
@@ -229,7 +234,7 @@ def _measure_explained_share(
 
 
 def _estimate_noise_levels(grey: UInt8[np.ndarray, "h2 w2"]) -> float:
-    """Estimate the noise's standard deviation from the median roughness."""
+    """Return the standard deviation of the noise in grey levels, estimated from the median roughness."""
     roughness = cv2.filter2D(grey, cv2.CV_32F, _ROUGHNESS)
     return float(np.median(np.abs(roughness[::4, ::4]))) / _MEDIAN_ROUGHNESS
 
@@ -237,7 +242,10 @@ def _estimate_noise_levels(grey: UInt8[np.ndarray, "h2 w2"]) -> float:
 def _match_brightness(
     before: UInt8[np.ndarray, "h2 w2"], grey: UInt8[np.ndarray, "h2 w2"]
 ) -> UInt8[np.ndarray, "h2 w2"]:
-    """Give the previous image this one's mean and contrast, so that a fade does not count as change."""
+    """Return the previous image with the mean and contrast of the new one.
+
+    Otherwise, a fade would count as a change of the scene.
+    """
     (old_mean, old_contrast), (mean, contrast) = (
         [float(value[0, 0]) for value in cv2.meanStdDev(picture)] for picture in (before, grey)
     )
@@ -257,12 +265,15 @@ def _warp(
 def _measure_difference_levels(
     a: UInt8[np.ndarray, "h2 w2"], b: UInt8[np.ndarray, "h2 w2"]
 ) -> Float[np.ndarray, "h2 w2"]:
-    """Mean absolute difference over a window around each pixel."""
+    """Return the mean absolute difference of two images in a window around each pixel, in grey levels."""
     return cv2.boxFilter(cv2.absdiff(a, b), cv2.CV_32F, (_WINDOW_PX, _WINDOW_PX))
 
 
 def _predict(track: Track, new: Track, motion: Motion, other: Motion, towards: int) -> Expectation:
-    """Predict the new frame; `towards` is the direction to the match in the other view (-1 left, 1 right)."""
+    """Predict the new frame of a view from its track.
+
+    `towards` is the direction to the match in the other view: -1 for left, 1 for right.
+    """
     carried = Track(*(np.empty_like(values) for values in track))
     carry(new.disparity_px, track, motion, carried)
     drift_px = np.empty(motion.calm.shape, np.float32)
@@ -274,7 +285,10 @@ def _predict(track: Track, new: Track, motion: Motion, other: Motion, towards: i
 def _find_calm_matches(
     other_calm: Bool[np.ndarray, "h2 w2"], disparity_px: Float[np.ndarray, "h2 w2"], towards: int
 ) -> Bool[np.ndarray, "h2 w2"]:
-    """Look up whether the other view is calm at each pixel's match, or at its border for a match outside."""
+    """Return the mask of pixels whose match in the other view is calm.
+
+    For a match outside the other view, the nearest border pixel counts.
+    """
     height, width = other_calm.shape
     rows, columns = np.indices((height, width), np.float32)
     there = columns + np.float32(towards / 2) * disparity_px
@@ -283,7 +297,7 @@ def _find_calm_matches(
 
 
 def _is_contradicted(new_tracks: list[Track], expected: list[Expectation]) -> bool:
-    """Whether most known pixels at rest have a new disparity; tests every fourth pixel."""
+    """Return whether the new disparity contradicts most known pixels at rest. Only a sample is tested."""
     asked, contradicted = [], []
     for new, (carried, calm, drift_px) in zip(new_tracks, expected, strict=True):
         new_px, old_px, frames = (
@@ -297,7 +311,7 @@ def _is_contradicted(new_tracks: list[Track], expected: list[Expectation]) -> bo
 
 
 def _update(new: Track, expected: Expectation) -> Track:
-    """Return the track updated by a new frame."""
+    """Return the track updated with a new frame."""
     mean = Track(*(np.empty_like(values) for values in new))
     blend(new, expected.carried, expected.calm, expected.drift_px, mean)
     return mean
@@ -306,10 +320,10 @@ def _update(new: Track, expected: Expectation) -> Track:
 @kernel
 @typing.no_type_check
 def carry(new_px, track, motion, carried):
-    """Warp `track` to the new frame and write it into `carried`; 0 frames where nothing is known.
+    """Warp `track` to the new frame and write it to `carried`, with 0 frames where nothing is known.
 
-    Motion is not exact to the pixel. So outside calm areas, of the nine pixels around the previous place,
-    take the one whose disparity is closest to new_px [H, W].
+    Motion is not accurate to the pixel. Outside calm areas, each pixel therefore takes the value of one of
+    the nine pixels around its previous position: the one whose disparity is closest to new_px [H, W].
     """
     old_px, old_confidence, old_frames = track.disparity_px, track.confidence, track.frames
     disparity_px, confidence, frames = carried.disparity_px, carried.confidence, carried.frames
@@ -325,7 +339,8 @@ def carry(new_px, track, motion, carried):
                 continue
             if not calm[i, j]:
                 middle_row, middle_column = row, column
-                # The centre must be clearly worse, so that noise does not shift the map to and fro.
+                # A neighbour must be clearly better than the centre: noise must not shift the map back
+                # and forth.
                 least_px = abs(old_px[row, column] - new_px[y, x]) - 0.5
                 for near_row in range(max(middle_row - 1, 0), min(middle_row + 2, height)):
                     for near_column in range(max(middle_column - 1, 0), min(middle_column + 2, width)):
@@ -341,10 +356,10 @@ def carry(new_px, track, motion, carried):
 @kernel
 @typing.no_type_check
 def measure_drift(new_px, carried, drift_px):
-    """Write the surface's disparity change around every second pixel into drift_px [H2, W2].
+    """Write the disparity change of the surface around every second pixel to drift_px [H2, W2].
 
-    This is the neighbourhood's mean change, shrunk by the James-Stein estimator, which subtracts the squared
-    standard error from the squared mean, and returns 0 if the result is negative.
+    The result is the mean change in the neighbourhood, shrunk by the James-Stein estimator: the mean times
+    1 - (standard error / mean) ** 2, or 0 where that factor is negative.
     """
     old_px, frames = carried.disparity_px, carried.frames
     height, width = new_px.shape
@@ -372,7 +387,7 @@ def measure_drift(new_px, carried, drift_px):
 @kernel
 @typing.no_type_check
 def blend(new, carried, calm, drift_px, mean):
-    """Write the track updated by the new frame into `mean`."""
+    """Write the track updated with the new frame to `mean`."""
     new_px, new_confidence = new.disparity_px, new.confidence
     old_px, old_confidence, old_frames = carried.disparity_px, carried.confidence, carried.frames
     disparity_px, confidence, frames = mean.disparity_px, mean.confidence, mean.frames

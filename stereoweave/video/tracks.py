@@ -1,4 +1,4 @@
-"""One video file or series of pictures: the time of each frame, and the frames that can be decoded."""
+"""Reading of one video file or series of pictures: the times of all frames, and the decodable frames."""
 
 import re
 from array import array
@@ -23,13 +23,13 @@ if TYPE_CHECKING:
 
 _SAMPLES = 0.1, 0.3, 0.5, 0.7, 0.9
 
-# Untagged colours are BT.709 from this width or height on, below it BT.601: the rule of players such as mpv.
+# As in players such as mpv, untagged colours are BT.709 from this width or height upwards, and BT.601 below.
 _HD_WIDTH_PX, _HD_HEIGHT_PX = 1280, 577
 _BT709, _BT601, _FULL_RANGE = 1, 5, 2  # av.video.reformatter's Colorspace and ColorRange
-_UNTAGGED = 0, 2  # AVCOL_SPC_RGB, which some encoders write for unknown, and AVCOL_SPC_UNSPECIFIED
+_UNTAGGED = 0, 2  # AVCOL_SPC_RGB, which some encoders write for "unknown", and AVCOL_SPC_UNSPECIFIED
 
-# AVStereo3D begins with its type, one of these, 0 (not stereo) or 8 (unknown), and its flags. The lowest flag
-# means that the right eye comes first.
+# AVStereo3D begins with its type and its flags. The type is one of these, 0 (not stereo) or 8 (unknown). The
+# lowest flag means that the right eye comes first.
 _STEREO_3D = {
     1: "side_by_side",
     2: "top_bottom",
@@ -43,17 +43,18 @@ _STEREO_3D = {
 # The first box of an MP4 or MOV file, after four bytes of length.
 _MP4_BOXES = b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot"
 
-# A file that ends earlier than its declared duration by more than this counts as cut off.
+# A file counts as cut off if it ends before its declared duration by more than this.
 _CUT_OFF_S = Fraction(1, 5)
 
 
 class Shot(NamedTuple):
-    """A frame that could be decoded.
+    """Decoded frame.
 
     Attributes:
-        number: The frame's number in the track.
-        picture: Converts the frame to uint8 RGB [H, W, 3]; frames that are not needed are not converted.
-        is_key_frame: Whether it is decoded without any earlier frame (a key frame).
+        number: Number of the frame in the track.
+        picture: Function that converts the frame to uint8 RGB [H, W, 3], so that only needed frames are
+            converted.
+        is_key_frame: Whether the frame can be decoded without any earlier frame.
     """
 
     number: int
@@ -62,22 +63,23 @@ class Shot(NamedTuple):
 
 
 class VideoTrack:
-    """The frames of one video file.
+    """Frames of one video file.
 
     Attributes:
-        name: As the caller gave it.
-        steps: Display time of each frame in the file, increasing, in steps of `time_base`.
-        retimed: Frames whose time stamp was missing or a duplicate, and which got a later one.
-        time_base: Seconds.
+        name: Path as given by the caller.
+        steps: Display time of each frame, strictly increasing, in units of `time_base`.
+        retimed: Numbers of the frames that are shown later because their time stamp was missing or a
+            duplicate.
+        time_base: Time unit in seconds.
         rate: Average frames per second.
-        size_px: Width and height of a whole frame, rotated as a player would.
-        declared_packing: The frame packing that the file declares, if any: a full-size one of
-            `PAIR_LAYOUTS`, or an unsupported one.
-        sound: The file, if it has sound.
-        truncation: Describes a file that ends early; None for a complete one.
+        size_px: Width and height of a whole frame after the rotation that players apply.
+        declared_packing: Frame packing that the file declares: a full-size one in `PAIR_LAYOUTS`, or an
+            unsupported one; None if the file declares none.
+        sound: Path of the file if it has sound, else None.
+        truncation: Message about a file that ends early; None for a complete file.
 
     Raises:
-        FormatError: No such file, not a video, or no frame can be decoded.
+        FormatError: The file does not exist, is not a video, or has no frame that can be decoded.
     """
 
     def __init__(self, path: Path) -> None:
@@ -89,16 +91,16 @@ class VideoTrack:
         with _opening(path) as (container, stream):
             first = next(_drop_corrupt(_decode(container, stream)), None)
             if first is None:
-                raise FormatError(f"{path}: expected a video, found no frame in it that can be decoded")
+                raise FormatError(f"{path}: expected a video, found a file without a decodable frame")
             self._frame_size_px = first.width, first.height
             self.size_px = self._frame_size_px if first.rotation % 180 == 0 else self._frame_size_px[::-1]
             self.declared_packing = _read_declared_packing(first)
 
     def shots(self, start: int) -> Iterator[Shot]:
-        """Yield the frames that can be decoded, in display order; always from the first one on.
+        """Yield the frames that can be decoded, in display order, always beginning with the first frame.
 
-        Ignoring `start` makes every run yield the same frames: what a damaged frame leaves in later ones
-        depends on all frames before it.
+        `start` is ignored so that all runs yield the same frames. The traces of a damaged frame in later
+        frames depend on every frame before it.
         """
         with _opening(self._path) as (container, stream):
             frames = _decode(container, stream)
@@ -112,7 +114,7 @@ class VideoTrack:
                     yield Shot(index, partial(_convert_to_rgb, frame), frame.key_frame)
 
     def samples(self) -> list[UInt8[np.ndarray, "h w 3"]]:
-        """Return images from all over the video, at least one."""
+        """Return one or more images from different parts of the video."""
         import av
 
         pictures: list[UInt8[np.ndarray, "h w 3"]] = []
@@ -133,7 +135,7 @@ class VideoTrack:
         self.steps: Sequence[int] = range(len(stamps))
         self.time_base = 1 / rate
         self._stamps: Sequence[int] | None = None
-        # Raw streams and some AVI files have no time stamps: use the order.
+        # Raw streams and some AVI files have no time stamps. Their frames are timed by order and frame rate.
         if 2 * len(set(stamps) - {None}) > len(stamps):
             self.time_base = Fraction(stream.time_base or 1)
             self._stamps = array("q", sorted(_fill_missing(stamps)))
@@ -141,15 +143,15 @@ class VideoTrack:
         self.rate = _choose_rate(self.steps, self.time_base, rate)
         claimed_s = Fraction(container.duration or 0, av.time_base)
         if reason is None and claimed_s > end_s + _CUT_OFF_S:
-            reason = f"it claims to last {float(claimed_s):.1f} s"
+            reason = f"its declared duration is {float(claimed_s):.1f} s"
         self.truncation = f"{self.name} breaks off after this frame ({reason})" if reason else None
 
 
 class PictureTrack:
-    """The frames of a series of pictures; for attributes see `VideoTrack`.
+    """Frames of a series of pictures, with the attributes of a `VideoTrack`.
 
     Raises:
-        FormatError: None of `files` can be read.
+        FormatError: No picture in `files` can be read.
     """
 
     declared_packing: str | None = None
@@ -166,24 +168,24 @@ class PictureTrack:
         self.size_px = first.shape[1], first.shape[0]
 
     def shots(self, start: int) -> Iterator[Shot]:
-        """Yield the pictures that can be read, from the last one at or before `start` on."""
+        """Yield the readable pictures, beginning with the last one at or before `start`."""
         before = next((index for index in range(start, 0, -1) if self._read_shot(index)), 0)
         yield from filter(None, map(self._read_shot, self.steps[before:]))
 
     def samples(self) -> list[UInt8[np.ndarray, "h w 3"]]:
-        """Return images from all over the series, at least one."""
+        """Return one or more images from different parts of the series."""
         starts = [int(share * len(self._files)) for share in (0.0, *_SAMPLES)]
         return [shot.picture() for start in starts for shot in islice(self.shots(start), 1)]
 
     def _read_first(self) -> UInt8[np.ndarray, "h w 3"]:
-        """Read the first picture that can be read."""
+        """Return the first picture that can be read."""
         problem: FormatError | None = None
         for file in self._files:
             try:
                 return read_image(file)
             except FormatError as error:
                 problem = problem or error
-        raise FormatError(f"{self.name}: expected pictures, found none that can be read: {problem}")
+        raise FormatError(f"{self.name}: expected pictures, found only unreadable files: {problem}")
 
     def _read_shot(self, index: int) -> Shot | None:
         picture = self._read_picture(index)
@@ -204,25 +206,26 @@ def open_track(path: Path, rate: Fraction | None) -> Track:
     """Open a video file, a folder of pictures, or the pictures that match a glob pattern.
 
     Args:
-        path: The file, the folder, or the pattern, such as frames/left_*.png; 2 comes before 10.
-        rate: Frames per second of pictures; default: 25.
+        path: File, folder or pattern, such as frames/left_*.png. Pictures are in natural order: 2 comes
+            before 10.
+        rate: Frame rate for pictures, in frames per second. Default: 25.
 
     Raises:
-        FormatError: No such file, folder or picture, or nothing in it can be read.
+        FormatError: The path does not exist, contains no pictures, or contains nothing that can be read.
         StereoweaveError: `rate` is given for a video.
     """
     files = list_picture_files(path)
     if files is None:
         if rate is not None:
-            raise StereoweaveError(f"{path}: expected pictures for a rate, found a video; leave the rate out")
+            raise StereoweaveError(f"{path}: expected pictures with a rate, found a video; omit the rate")
         return VideoTrack(path)
     if not files:
-        raise FormatError(f"{path}: expected a video or pictures, found no picture there")
+        raise FormatError(f"{path}: expected a video or pictures, found no pictures")
     return PictureTrack(str(path), files, rate or Fraction(25))
 
 
 def list_picture_files(path: Path) -> list[Path] | None:
-    """List the pictures in a folder or matching a glob pattern, in natural order; None for any other path."""
+    """Return the pictures in a folder or matching a glob pattern, in natural order; None for other paths."""
     if path.is_dir():
         found = path.iterdir()
     elif not path.exists() and re.search(r"[*?\[]", path.name):
@@ -243,18 +246,18 @@ def _opening(path: Path) -> Iterator[tuple["av.container.InputContainer", "av.Vi
     with container:
         stream = container.streams.best("video")
         if not isinstance(stream, av.VideoStream) or stream.codec_context is None:
-            raise FormatError(f"{path}: expected a video, found no picture track that can be decoded")
-        # With more threads FFmpeg conceals damage in H.264 badly or not at all, and not reproducibly.
+            raise FormatError(f"{path}: expected a video, found a file without a decodable video track")
+        # With several threads, FFmpeg conceals damage in H.264 poorly, if at all, and not reproducibly.
         stream.codec_context.thread_count = 1
         stream.codec_context.copy_opaque = True  # passes the packet's rank on to the frame
         if stream.codec_context.name == "mjpeg":
-            # By default it returns truncated pictures, grey at the bottom, as intact.
+            # By default, the decoder returns truncated pictures, grey at the bottom, as if they were intact.
             stream.codec_context.options = {"err_detect": "explode"}
         yield container, stream
 
 
 def _decode(container: "av.container.InputContainer", stream: "av.VideoStream") -> Iterator["av.VideoFrame"]:
-    """Decode every packet up to the end or damage of the file; frames come in display order."""
+    """Yield the decoded frames in display order, up to the end of the file or unrecoverable damage."""
     import av
 
     ranks = count()
@@ -272,7 +275,7 @@ def _decode(container: "av.container.InputContainer", stream: "av.VideoStream") 
 def _stamps(
     container: "av.container.InputContainer", stream: "av.VideoStream"
 ) -> tuple[list[int | None], Fraction, str | None]:
-    """Return every frame's time stamp, the end of all tracks, and why reading stopped early, if it did."""
+    """Return all time stamps, the end of the last track in seconds, and the reason if reading ended early."""
     import av
 
     stamps: list[int | None] = []
@@ -293,20 +296,22 @@ def _is_frame(packet: "av.Packet[Any]") -> bool:
 
 
 def _fill_missing(stamps: Sequence[int | None]) -> list[int]:
-    """Replace missing time stamps by that of the previous frame in the file."""
+    """Replace each missing time stamp with the last one before it in the file."""
     known = next(stamp for stamp in stamps if stamp is not None)
     return [known := known if stamp is None else stamp for stamp in stamps]
 
 
 def _separate_duplicates(stamps: Sequence[int], frame_steps: int) -> tuple["array[int]", list[int]]:
-    """Make sorted time stamps strictly increasing: move duplicates by one frame, or halfway to the next.
+    """Make sorted time stamps strictly increasing by delaying duplicates.
+
+    A duplicate is delayed by one frame, or by half the time to the next frame if that is shorter.
 
     Args:
-        stamps: In steps of a time base.
-        frame_steps: Usual distance between frames, in the same steps.
+        stamps: Sorted time stamps, in units of a time base.
+        frame_steps: Usual interval between frames, in the same units.
 
     Returns:
-        The times, and the numbers of the retimed frames.
+        The new times, and the numbers of the delayed frames.
     """
     steps, retimed = array("q", stamps[:1]), []
     later = [b for a, b in pairwise(stamps) if b > a]
@@ -325,7 +330,7 @@ def _separate_duplicates(stamps: Sequence[int], frame_steps: int) -> tuple["arra
 def _number_by_stamp(
     frames: Iterator["av.VideoFrame"], stamps: Sequence[int]
 ) -> Iterator[tuple[int, "av.VideoFrame"]]:
-    """Number frames by their time stamps; frames with equal stamps keep their order."""
+    """Yield each frame with its number, found by time stamp. Frames with equal stamps keep their order."""
     last = -1
     for frame in frames:
         stamp = stamps[max(last, 0)] if frame.pts is None else frame.pts
@@ -338,10 +343,9 @@ def _number_by_stamp(
 def _number_by_rank(
     frames: Iterator["av.VideoFrame"], stream: "av.VideoStream"
 ) -> Iterator[tuple[int, "av.VideoFrame"]]:
-    """Number frames by the ranks of their packets in the file.
+    """Yield each frame with its number, found by the position of its packet among all packets.
 
-    Without B-frames, no frame is shown before its rank. With B-frames, lost frames are noticed only at the
-    next key frame.
+    Without B-frames, a lost frame is noticed at the next frame; with B-frames, only at the next key frame.
     """
     index = -1
     for frame in frames:
@@ -356,15 +360,15 @@ def _drop_corrupt(frames: Iterator["av.VideoFrame"]) -> Iterator["av.VideoFrame"
 
 
 def _describe_unopened(path: Path, error: "av.error.FFmpegError") -> str:
-    """Describe what was found instead of a video."""
+    """Return what was found instead of a video, for an error message."""
     beginning = b""
     with suppress(OSError), path.open("rb") as file:
         beginning = file.read(8)
         if not beginning:
             return "an empty file"
-    found = f"one that cannot be opened ({_describe_error(error)})"
+    found = f"none that FFmpeg can open ({_describe_error(error)})"
     if beginning[4:] in _MP4_BOXES:
-        found += "; if it was cut off, it lost its index: record or download it again"
+        found += "; if the file was cut off, its index is lost: record or download it again"
     return found
 
 
@@ -390,7 +394,7 @@ def _convert_to_rgb(frame: "av.VideoFrame") -> UInt8[np.ndarray, "h w 3"]:
 def _read_declared_packing(frame: "av.VideoFrame") -> str | None:
     from av.sidedata.sidedata import Type
 
-    # PyAV's type stubs lack some kinds of side data.
+    # The type stubs of PyAV lack some kinds of side data.
     side_data: Any = frame.side_data
     if Type.STEREO3D not in side_data:
         return None
@@ -401,7 +405,7 @@ def _read_declared_packing(frame: "av.VideoFrame") -> str | None:
 
 
 def _choose_rate(steps: Sequence[int], time_base: Fraction, average: Fraction) -> Fraction:
-    """Return the container's frame rate, or the measured one if they differ by more than 1 %."""
+    """Return the frame rate of the container, or the measured one if the two differ by more than 1 %."""
     if len(steps) < 2:
         return average
     measured = Fraction(len(steps) - 1) / ((steps[-1] - steps[0]) * time_base)

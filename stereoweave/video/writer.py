@@ -1,6 +1,6 @@
-"""Writing of the parts of a video, and joining them with the sound.
+"""Writing of the parts of a video, and joining of the parts with the sound.
 
-A part is a NUT file, which stores frame times of any time base exactly. Parts are joined packet by packet:
+A part is a NUT file, which stores frame times exactly for any time base. Parts are joined packet by packet:
 nothing is encoded twice, and sound is copied bit for bit.
 """
 
@@ -37,9 +37,10 @@ else:
     from av.packet import Packet as AnyPacket
 
 CONTAINERS = {".mp4": "mp4", ".mkv": "matroska", ".mov": "mov"}
-# Sound starts before 0 by its decoder's priming samples; by default the muxer would delay the whole video.
+# Sound starts before 0, with the priming samples of its decoder. By default, the muxer would therefore delay
+# the whole video.
 _EXACT_TIMES = {"avoid_negative_ts": "disabled"}
-# Time unit of stream starts: a multiple of 90 kHz, 48 kHz and the numerators of rates such as 30000/1001.
+# Time scale of stream starts: a multiple of 90 kHz, 48 kHz and the numerators of rates such as 30000/1001.
 _EXACT_STARTS = {"movie_timescale": "720000"}
 # Enough to include the first packet of every audio stream.
 _TRIED_PACKETS = 64
@@ -50,7 +51,7 @@ Picture = UInt8[np.ndarray, "h w 3"] | UInt16[np.ndarray, "h w"]
 
 
 class Encoding(NamedTuple):
-    """Settings of the encoder, in FFmpeg's terms."""
+    """Encoder settings, as FFmpeg names them."""
 
     codec: str
     pixel_format: str
@@ -58,18 +59,18 @@ class Encoding(NamedTuple):
     options: Mapping[str, str]
 
 
-# Plays everywhere and looks like the input. Without B-frames (bf), parts can be joined at any times. With
+# Plays everywhere and looks like the input. Without B-frames (bf), parts can be joined at any frame. With
 # macroblock-tree rate control (mbtree), 1 part in 500 differed between runs on the same frames, even with one
 # thread (x264 165); without it, 0 of 4,447.
 H264 = Encoding(
     "libx264", "yuv420p", ColorRange.MPEG, {"crf": "17", "preset": "fast", "bf": "0", "mbtree": "0"}
 )
-# Lossless; as archives do, every frame is a key frame with checksums.
+# Lossless. As is usual in archives, every frame is a key frame with checksums.
 GREY16 = Encoding("ffv1", "gray16le", ColorRange.JPEG, {"level": "3", "g": "1", "slicecrc": "1"})
 
 
 class Packing(NamedTuple):
-    """Frame packing: Matroska's stereo mode, and H.264's number, None where that would swap the eyes."""
+    """Frame packing: Matroska's stereo mode, and H.264's number, or None if that would swap the eyes."""
 
     stereo_mode: str
     frame_packing: int | None
@@ -77,14 +78,14 @@ class Packing(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Recorder:
-    """Writes the parts of a video and joins them.
+    """Encoder that writes the parts of a video and joins them.
 
     Attributes:
         encoding: H264, or GREY16 for 16-bit grey.
         time_base: Unit of all frame times, in seconds.
         rate: Frames per second; sets the duration of the last frame.
-        packing: Frame packing of two views, if any.
-        threads: Number of threads.
+        packing: Frame packing to declare in the file, if any.
+        threads: Number of encoder threads.
     """
 
     encoding: Encoding
@@ -94,9 +95,9 @@ class Recorder:
     threads: int = 1
 
     def write_part(self, path: Path, pictures: Iterable[tuple[Fraction, Picture]]) -> None:
-        """Write images of one size, each with its time in seconds, as a NUT file.
+        """Write images of the same size, each with its time in seconds, to a NUT file.
 
-        H.264 halves the resolution of colour, so an odd size is padded by repeating the last row or column.
+        H.264 halves the colour resolution, so an odd size is padded by repeating the last row or column.
         """
         with av.open(str(path), "w", format="nut") as part:
             stream = None
@@ -109,15 +110,15 @@ class Recorder:
                 part.mux(stream.encode())
 
     def join(self, parts: Sequence[Path], sound: Path | None, out: Path, metadata: Mapping[str, str]) -> None:
-        """Join all parts with all sound of the file `sound`; copies every packet unchanged.
+        """Join all parts with all audio streams of the file `sound`, copying every packet unchanged.
 
         MP4 and MOV store all times exactly; Matroska rounds to milliseconds.
 
         Args:
-            parts: Files of `write_part`, in order.
-            sound: The video whose sound and start time are copied; None for a silent video.
-            out: The file to write; its ending must be in `CONTAINERS`.
-            metadata: The file's metadata.
+            parts: Files written by `write_part`, in order.
+            sound: Video whose sound and start time are copied; None for a silent video.
+            out: Output file; its ending must be in `CONTAINERS`.
+            metadata: Metadata of the output file.
         """
         with ExitStack() as stack:
             temporary = stack.enter_context(replacing(out))
@@ -133,14 +134,14 @@ class Recorder:
                 source = stack.enter_context(av.open(str(sound)))
                 start_s = _find_start_s(source.streams.best("video"))
                 sound_packets = [_read_sound(source, _copy_sound_streams(source, container))]
-            # In order of time, because the muxer buffers packets that are ahead of the other streams.
+            # Merge the packets by time, because the muxer buffers packets that are ahead of other streams.
             for packet in merge(
                 self._read_packets(parts, stream, start_s), *sound_packets, key=_decoding_time_s
             ):
                 container.mux(packet)
 
     def _add_stream(self, part: OutputContainer, frame: VideoFrame) -> VideoStream:
-        """Add a stream for frames like this one, with the colours of HD video (BT.709)."""
+        """Add a video stream for frames of this size, with the colours of HD video (BT.709)."""
         options = dict(self.encoding.options)
         if self.packing and self.packing.frame_packing is not None:
             options["x264-params"] = f"frame-packing={self.packing.frame_packing}"
@@ -155,7 +156,7 @@ class Recorder:
     def _read_packets(
         self, parts: Sequence[Path], stream: VideoStream, start_s: Fraction
     ) -> Iterator[AnyPacket]:
-        """Yield the packets of all parts for one stream, delayed by `start_s`."""
+        """Yield the packets of all parts, assigned to `stream` and delayed by `start_s`."""
         for path in parts:
             with av.open(str(path)) as part:
                 for packet in _drop_empty(part.demux(video=0)):
@@ -167,17 +168,17 @@ class Recorder:
 
 
 def check_container(path: Path, sound: Path | None) -> None:
-    """Raise StereoweaveError unless `path` has the ending of a container that can hold the file's sound."""
+    """Raise StereoweaveError unless the ending of `path` selects a container that can hold the sound."""
     if path.suffix.lower() not in CONTAINERS:
         raise StereoweaveError(
-            f"{path}: expected the ending of a video, {', '.join(CONTAINERS)}, found {path.suffix!r}"
+            f"{path}: expected a file name ending in {' or '.join(CONTAINERS)}, found {path.suffix!r}"
         )
     if sound is None or _can_hold(path.suffix, sound):
         return
     with av.open(str(sound)) as source:
         codecs = ", ".join(sorted({stream.codec_context.name for stream in source.streams.audio}))
     others = [ending for ending in CONTAINERS if _can_hold(ending, sound)]
-    remedy = f"{others[0]} holds it" if others else "convert the sound first, to FLAC for instance"
+    remedy = f"use {others[0]} instead" if others else "convert the sound first, for example to FLAC"
     raise StereoweaveError(
         f"{path}: expected sound that {path.suffix} can hold, found {codecs} in {sound}; {remedy}"
     )
@@ -198,7 +199,7 @@ def _make_frame(picture: Picture) -> VideoFrame:
 
 
 def _can_hold(ending: str, sound: Path) -> bool:
-    """Test whether a container with this ending can hold a file's sound, by muxing its beginning."""
+    """Return whether a container with this ending can hold the sound of a file, tested by muxing."""
     container = CONTAINERS[ending.lower()]
     try:
         with av.open(str(sound)) as source, av.open(BytesIO(), "w", format=container) as output:
@@ -209,7 +210,7 @@ def _can_hold(ending: str, sound: Path) -> bool:
 
 
 def _copy_sound_streams(source: InputContainer, output: OutputContainer) -> dict[int, AudioStream]:
-    """Add a stream to a video for each audio stream of the source; by the source's indices."""
+    """Add each audio stream of the source to the output. Return the new streams by source index."""
     streams = {}
     for stream in source.streams.audio:
         streams[stream.index] = copy = output.add_stream_from_template(stream, opaque=True)
@@ -219,20 +220,20 @@ def _copy_sound_streams(source: InputContainer, output: OutputContainer) -> dict
 
 
 def _read_sound(source: InputContainer, streams: Mapping[int, AudioStream]) -> Iterator[AnyPacket]:
-    """Yield the audio packets of a source for the new streams."""
-    with suppress(FFmpegError):  # the file breaks off, which `StereoVideo` reports
+    """Yield the audio packets of a source, assigned to the new streams."""
+    with suppress(FFmpegError):  # a file that ends early is reported by `StereoVideo`
         for packet in _drop_empty(source.demux(*source.streams.audio)):
             packet.stream = streams[packet.stream_index]
             yield packet
 
 
 def _find_start_s(stream: Stream | None) -> Fraction:
-    """Return the time of the first frame, in seconds of its file's clock."""
+    """Return the time of the first frame of a stream, in seconds on the clock of its file."""
     return (stream.start_time or 0) * (stream.time_base or Fraction(0)) if stream else Fraction(0)
 
 
 def _drop_empty(packets: Iterable[AnyPacket]) -> Iterator[AnyPacket]:
-    """Drop the empty packets at the end of a demuxer."""
+    """Yield the packets except the empty ones that a demuxer emits at the end."""
     return (packet for packet in packets if packet.size)
 
 

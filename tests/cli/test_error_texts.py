@@ -56,7 +56,7 @@ ERRORS = {
     f"view {PAIR} --position 3 -o out.png": "--position: expected -1 to 2 (0 left camera, 1 right), got 3",
     f"view {PAIR} --layout diagonal -o out.png": "--layout: expected one of "
     f"{', '.join([*VIEW_LAYOUTS, *ANIMATIONS])}, found 'diagonal'",
-    "video plain.png -o out.mp4": "expected one kind of video to make, found none; choose one (--depth, "
+    "video plain.png -o out.mp4": "expected one kind of output, found none; choose one (--depth, "
     "--depth16, --position, --layout)",
     "video plain.png --depth -o out.mp4": "plain.png: expected 3-D video, two views side by side or one "
     "above the other, found too plain a picture to tell; give two files, left and right; or choose one of "

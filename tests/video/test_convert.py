@@ -1,4 +1,4 @@
-"""A video through the command: its frames, times and sound, and what becomes of one that is interrupted."""
+"""Conversion of videos with the command: frames, times, sound, and resuming after an interruption."""
 
 import os
 import signal
@@ -24,7 +24,7 @@ from stereoweave.rendering.renderer import Renderer
 from stereoweave.stereo import StereoPair
 from stereoweave.video.reader import StereoFrame, StereoVideo, open_video
 
-# So that a part, 10 s, is 5 frames.
+# A part lasts 10 s, so it has 5 of these frames.
 SLOW_MS = 2000
 
 
@@ -36,14 +36,14 @@ def slow_video(path: Path, count: int = 13) -> Path:
 
 @pytest.fixture(autouse=True)
 def default_interrupts():
-    """Where a shell starts the tests in the background, Python leaves Ctrl-C ignored."""
+    """Restore the handler for Ctrl-C, which Python ignores if a shell starts the tests in the background."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
 
 
 def run(video: Path, out: Path, *words: str) -> int:
-    # Of two threads the second would wait as busily as the first one works, while other tests have its core.
+    # With two threads, the second would busy-wait on a core that other tests need.
     return main(["video", str(video), "-o", str(out), "--threads", "1", *words])
 
 
@@ -65,7 +65,7 @@ def estimate_of(frame: StereoFrame):
     return Matcher("small", threads=1).estimate(frame.left, frame.right)
 
 
-def test_as_many_frames_at_their_uneven_times_and_the_same_sound(tmp_path, capsys):
+def test_a_conversion_keeps_uneven_frame_times_and_the_sound(tmp_path, capsys):
     times_ms = [0, 40, 90, 130, 170, 300, 330, 370]
     video = write_side_by_side(
         tmp_path / "in.mp4", example_pairs(8), times_ms=times_ms, sound=True, codec="libx264"
@@ -86,11 +86,11 @@ def test_depth_in_16_bits_is_disparity_times_256(tmp_path):
             container.metadata["COMMENT"] == "16-bit grey: disparity of the left view in pixels = value / 256"
         )
         grey = next(container.decode(video=0)).to_ndarray()
-    # The first frame has none before it to be filtered with.
+    # The first frame has no predecessor, so the temporal filter leaves it unchanged.
     np.testing.assert_array_equal(grey, np.rint(256 * estimate_of(first).disparity_px))
 
 
-def test_colours_of_depth_mean_the_same_in_all_of_the_video(tmp_path, capsys):
+def test_depth_colours_mean_the_same_throughout_a_video(tmp_path, capsys):
     near = example_pairs(1)[0]
     far = (255 - near[0][::-1],) * 2
     video = write_side_by_side(tmp_path / "in.mp4", [near, near, far, far], codec="libx264")
@@ -107,7 +107,7 @@ def test_colours_of_depth_mean_the_same_in_all_of_the_video(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("name", ["side_by_side", "anaglyph_dubois"])
-def test_a_layout_is_what_it_is_of_a_still_and_viewers_know_it_by_its_name(tmp_path, name):
+def test_a_layout_equals_that_of_a_still_and_marks_the_file_name(tmp_path, name):
     video = write_side_by_side(tmp_path / "in.mp4", example_pairs(2), codec="libx264")
     assert run(video, tmp_path / "out.mp4", "--layout", name, "--strength", "1.5", "--convergence", "12") == 0
     first = next(open_video([video]).frames())
@@ -119,24 +119,24 @@ def test_a_layout_is_what_it_is_of_a_still_and_viewers_know_it_by_its_name(tmp_p
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(["in.mp4", made.name])
 
 
-def test_what_lies_upon_one_another_keeps_the_videos_middle_in_place(tmp_path):
+def test_overlaid_views_converge_at_the_median_disparity_of_the_video(tmp_path):
     video = write_side_by_side(tmp_path / "in.mp4", example_pairs(3), codec="libx264")
     for name, words in {"auto": (), "none": ("--convergence", "0")}.items():
         assert run(video, tmp_path / f"{name}.mp4", "--layout", "anaglyph_grey", *words) == 0
-    # The eyes' pictures, red and green, lie apart by the disparity where nothing is kept in place.
+    # Without convergence, the red and the green view are offset by the disparity.
     apart = {name: _red_from_green(rgb_of(tmp_path / f"{name}.mp4")[1]) for name in ("auto", "none")}
     assert apart["auto"] < apart["none"] / 2
 
 
 def converged_pairs(moved_px: list[int]) -> list[tuple[np.ndarray, np.ndarray]]:
-    """The same window of the example pair, its disparities lower by each of these."""
+    """Return a window of the example pair for each shift, by which its disparities are lower."""
     left, right = (read_image(TEXTURED / f"{eye}.png") for eye in ("left", "right"))
     rows = slice(200, 296)
     return [(left[rows, 180:436], right[rows, 180 - by_px : 436 - by_px]) for by_px in moved_px]
 
 
-def test_disparities_behind_the_screen_are_found_however_late_in_a_video(tmp_path, capsys):
-    # 11 to 21 px without the move; the last of these frames begins after a minute.
+def test_disparities_behind_the_screen_are_found_late_in_a_video(tmp_path, capsys):
+    # Disparities are 11 to 21 px without the shift. The last two frames begin after more than a minute.
     pairs = converged_pairs([22] * 6 + [62] * 2)
     times_ms = range(0, 8 * 12_000, 12_000)
     video = write_side_by_side(tmp_path / "in.mp4", pairs, times_ms=times_ms, codec="libx264")
@@ -149,7 +149,7 @@ def test_disparities_behind_the_screen_are_found_however_late_in_a_video(tmp_pat
     )
     assert -62 + 10 < low_px < -62 + 16
     assert -22 + 16 < high_px < -22 + 22
-    # A point at disparity d is at x - d / 2 in the view halfway: the move brings it 31 columns to the right.
+    # A point with disparity d is at x - d / 2 in the middle view: the shift moves it 31 columns to the right.
     assert run(video, tmp_path / "view.mp4", "--position", "0.5", *words) == 0
     still = write_side_by_side(tmp_path / "still.mp4", converged_pairs([0]), codec="libx264")
     assert run(still, tmp_path / "unmoved.mp4", "--position", "0.5", *words) == 0
@@ -157,11 +157,11 @@ def test_disparities_behind_the_screen_are_found_however_late_in_a_video(tmp_pat
     assert np.abs(moved[:, 71:] - unmoved[:, 40:-31]).mean() < 6
 
 
-def test_depth_in_16_bits_says_what_it_cannot_hold(tmp_path, capsys):
+def test_depth_in_16_bits_warns_of_disparities_outside_its_range(tmp_path, capsys):
     video = write_side_by_side(tmp_path / "in.mp4", converged_pairs([40, 40]), codec="libx264")
     assert run(video, tmp_path / "out.mkv", "--depth16", "--format", "side_by_side") == 0
     [line] = [line for line in capsys.readouterr().err.splitlines() if "16-bit" in line]
-    assert line.startswith("16-bit grey holds 0 to 255.99 px: this video's disparities, -2")
+    assert line.startswith("16-bit grey covers 0 to 255.99 px; this video's disparities of -2")
     assert line.endswith("are clipped; show all of them in colours (--depth)")
 
 
@@ -170,7 +170,7 @@ def _red_from_green(anaglyph: np.ndarray) -> float:
 
 
 class Interrupted(StereoVideo):
-    """A video whose reader gets the signal of Ctrl-C at frame 8, once a part is finished."""
+    """Video whose reader raises the signal of Ctrl-C at frame 8, once a part is finished."""
 
     def frames(self, start: int = 0) -> Iterator[StereoFrame]:
         for index, frame in enumerate(super().frames(start), start):
@@ -180,7 +180,7 @@ class Interrupted(StereoVideo):
 
 
 @pytest.mark.parametrize("words", [("--position", "0.4"), ("--layout", "rgbd")])
-def test_a_video_that_was_interrupted_goes_on_to_the_same_frames(tmp_path, monkeypatch, capsys, words):
+def test_an_interrupted_conversion_resumes_with_the_same_frames(tmp_path, monkeypatch, capsys, words):
     video = slow_video(tmp_path / "in.mp4")
     assert run(video, tmp_path / "whole.mp4", *words) == 0
     with monkeypatch.context() as patch:
@@ -200,7 +200,7 @@ def test_a_video_that_was_interrupted_goes_on_to_the_same_frames(tmp_path, monke
     assert times_of(broken) == times_of(video)
 
 
-def test_a_video_that_is_being_made_is_refused_until_its_process_is_killed(tmp_path, capsys):
+def test_an_output_in_use_is_refused_until_its_process_is_killed(tmp_path, capsys):
     video, out = slow_video(tmp_path / "in.mp4"), tmp_path / "out.mp4"
     program = "import sys; from stereoweave.cli.root import main; sys.exit(main())"
     words = ["video", video, "-o", out, "--depth", "--threads", "1"]
@@ -221,7 +221,7 @@ def test_a_video_that_is_being_made_is_refused_until_its_process_is_killed(tmp_p
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in.mp4", "link", "out.mp4"]
 
 
-def test_another_order_does_not_go_on_with_what_was_begun(tmp_path, monkeypatch, capsys):
+def test_parts_made_with_other_settings_are_not_resumed(tmp_path, monkeypatch, capsys):
     video = slow_video(tmp_path / "in.mp4", 10)
     with monkeypatch.context() as patch:
         patch.setattr("stereoweave.video.reader.StereoVideo", Interrupted)
@@ -230,15 +230,15 @@ def test_another_order_does_not_go_on_with_what_was_begun(tmp_path, monkeypatch,
     assert run(video, tmp_path / "out.mp4", "--position", "0.6") == 2
     folder = tmp_path / "out.mp4.parts"
     assert capsys.readouterr().err == (
-        f"stereoweave: {folder}: expected parts of the same video, found parts begun with --position 0.4, "
-        "with --convergence 3.0; remove that folder, or give the same settings again\n"
+        f"stereoweave: {folder}: expected parts of the same video, found parts made with --position 0.4, "
+        "with --convergence 3.0; remove this folder, or rerun with the same settings\n"
     )
 
 
-def test_where_the_disk_fills_up_one_line_says_what_stays_and_how_to_go_on(tmp_path):
+def test_a_full_disk_is_reported_in_one_line_that_says_how_to_resume(tmp_path):
     video = slow_video(tmp_path / "in.mp4", 45)
     assert run(video, tmp_path / "whole.mkv", "--depth16") == 0
-    # Each part finds room, and so does the state after it (0.4 MB); all of them joined do not.
+    # There is room for each part and for the state after it (0.4 MB), but not for the joined video.
     room_bytes = int(0.8 * (tmp_path / "whole.mkv").stat().st_size)
     words = ["video", str(video), "-o", str(tmp_path / "out.mkv"), "--depth16"]
     program = (
@@ -259,7 +259,7 @@ def test_where_the_disk_fills_up_one_line_says_what_stays_and_how_to_go_on(tmp_p
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in.mp4", "out.mkv", "whole.mkv"]
 
 
-def test_a_damaged_frame_is_told_with_its_time_and_is_not_the_end(tmp_path, capsys):
+def test_a_damaged_frame_is_reported_with_its_time_and_does_not_end_the_video(tmp_path, capsys):
     video = damage(write_side_by_side(tmp_path / "in.mkv", example_pairs(12), codec="mjpeg"), 5)
     assert run(video, tmp_path / "out.mkv", "--position", "0.5") == 0
     told = capsys.readouterr().out.splitlines()
@@ -275,30 +275,30 @@ def test_a_damaged_frame_is_told_with_its_time_and_is_not_the_end(tmp_path, caps
         (
             "out.mp4",
             ["--depth", "--position", "0"],
-            "expected one kind of video to make, found depth and position; ",
+            "expected one kind of output, found depth and position; ",
         ),
         ("out.mp4", ["--layout", "wiggle"], "--layout: expected one of side_by_side, "),
         ("out.mp4", ["--position", "2.5"], "--position: expected -1 to 2"),
         ("out.mp4", ["--position", "1", "--strength", "4"], "position 1 at strength 4"),
-        ("out.gif", ["--depth"], "expected the ending of a video, .mp4, .mkv, .mov, found '.gif'"),
-        ("out.mp4", ["--depth16"], "expected the ending .mkv for depth in 16 bits, found '.mp4'"),
-        ("in.mp4", ["--depth"], "expected another file than the input video"),
+        ("out.gif", ["--depth"], "expected a file name ending in .mp4 or .mkv or .mov, found '.gif'"),
+        ("out.mp4", ["--depth16"], "expected a file name ending in .mkv for 16-bit depth, found '.mp4'"),
+        ("in.mp4", ["--depth"], "expected an output other than the input, found the same file"),
         ("out.mp4", ["--depth", "--model", "huge"], "unknown model 'huge'"),
         ("out.mp4", ["--depth", "--format", "diagonal"], "--format: expected one of side_by_side"),
         ("out.mp4", ["--position", "0", "--convergence", "nan"], "--convergence: expected a finite number"),
         ("out.mp4", ["--layout", "quilt", "--convergence", "-inf"], "expected a finite number, found -inf"),
         ("out.mp4", ["--position", "0.5", "--strength", "inf"], "--strength: expected a finite number"),
         ("out.mp4", ["--depth", "--convergence", "3"], "--convergence: expected a view or a layout of views"),
-        ("out.mkv", ["--depth16", "--strength", "2"], "for it, found depth16"),
-        ("out.mp4", ["--layout", "rgbd", "--convergence", "0"], "for it, found layout rgbd"),
-        ("out.mp4", ["--depth", "--rate", "24"], "expected pictures for a rate, found a video"),
+        ("out.mkv", ["--depth16", "--strength", "2"], "as output, found depth16"),
+        ("out.mp4", ["--layout", "rgbd", "--convergence", "0"], "as output, found layout rgbd"),
+        ("out.mp4", ["--depth", "--rate", "24"], "expected pictures with a rate, found a video"),
         ("out.mp4", ["--depth", "--rate", "1/0"], "--rate: expected frames per second"),
         ("out.mp4", ["--depth", "--rate", "-5"], "--rate: expected frames per second"),
         ("out.mp4", ["--depth", "--rate", "1e300"], "at most 1000, found '1e300'"),
         ("out.mp4", ["--depth", "--rate", ""], "--rate: expected frames per second"),
     ],
 )
-def test_what_cannot_be_made_is_one_line_before_any_work(tmp_path, capsys, out, words, told):
+def test_an_impossible_output_is_refused_in_one_line_before_any_work(tmp_path, capsys, out, words, told):
     video = write_side_by_side(tmp_path / "in.mp4", example_pairs(2), codec="libx264")
     before = video.read_bytes()
     assert run(video, tmp_path / out, *words) == 2
@@ -324,7 +324,7 @@ def test_the_old_name_of_format_is_accepted_with_a_warning(capsys, command):
     assert "--arrangement" not in capsys.readouterr().out
 
 
-def test_what_is_no_3d_video_is_one_line(tmp_path, capsys):
+def test_a_file_that_is_not_a_3d_video_is_refused_in_one_line(tmp_path, capsys):
     wide = [np.hstack([left, np.flip(left)]) for left, _ in example_pairs(2)]
     flat = write_video(tmp_path / "flat.mp4", wide, codec="libx264")
     broken = tmp_path / "broken.mp4"
@@ -336,7 +336,7 @@ def test_what_is_no_3d_video_is_one_line(tmp_path, capsys):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["broken.mp4", "flat.mp4"]
 
 
-def test_swapped_sides_are_told_with_the_frame_packing_that_mends_them(tmp_path, capsys):
+def test_swapped_views_are_noted_with_the_frame_packing_that_corrects_them(tmp_path, capsys):
     pairs = example_pairs(2, width=320, height=192)
     crossed = write_side_by_side(tmp_path / "in.mp4", pairs, layout="crossed", codec="libx264")
     assert run(crossed, tmp_path / "a.mp4", "--depth", "--format", "side_by_side") == 0
@@ -346,8 +346,8 @@ def test_swapped_sides_are_told_with_the_frame_packing_that_mends_them(tmp_path,
     assert "swapped" not in capsys.readouterr().err
 
 
-def test_a_video_is_looked_at_beyond_its_first_minute(tmp_path, capsys):
-    # At 6 frames a minute, so that two of the three that are looked at, number 1, 4 and 7, are swapped.
+def test_defects_are_found_beyond_the_first_minute(tmp_path, capsys):
+    # At 6 frames per minute. Of the three checked frames, 1, 4 and 7, the last two are swapped.
     pairs = example_pairs(8, width=320, height=192)
     pairs = [pair if index < 3 else pair[::-1] for index, pair in enumerate(pairs)]
     times_ms = range(0, 8 * 10_000, 10_000)
@@ -356,7 +356,7 @@ def test_a_video_is_looked_at_beyond_its_first_minute(tmp_path, capsys):
     assert capsys.readouterr().err.count("0:01:10.000 ") == 1
 
 
-def test_swapped_videos_are_told_without_a_frame_packing(tmp_path, capsys):
+def test_swapped_videos_are_noted_without_a_frame_packing(tmp_path, capsys):
     pairs = example_pairs(2, width=320, height=192)
     left, right = (write_video(tmp_path / f"{eye}.mp4", [pair[eye] for pair in pairs]) for eye in (0, 1))
     words = ["video", str(right), str(left), "-o", str(tmp_path / "out.mp4"), "--position", "0"]
@@ -379,7 +379,7 @@ def test_a_series_of_pictures_has_the_rate_that_is_given(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("pattern", ["", "*.png"])
-def test_a_series_of_which_one_picture_changed_is_not_gone_on_with(tmp_path, monkeypatch, capsys, pattern):
+def test_a_series_with_a_changed_picture_is_not_resumed(tmp_path, monkeypatch, capsys, pattern):
     folder = write_pictures(tmp_path / "frames", 10)
     out = (folder / pattern).with_name("out.mp4")
     words = ["--position", "0.5", "--rate", "0.5"]
@@ -390,27 +390,27 @@ def test_a_series_of_which_one_picture_changed_is_not_gone_on_with(tmp_path, mon
     os.utime(folder / "006.png", ns=(status.st_atime_ns, status.st_mtime_ns + 1_000_000))
     capsys.readouterr()
     assert run(folder / pattern, out, *words) == 2
-    assert "found parts begun with another video;" in capsys.readouterr().err
+    assert "found parts made with another video;" in capsys.readouterr().err
 
 
-def test_a_video_taken_apart_otherwise_is_not_gone_on_with(tmp_path, monkeypatch, capsys):
+def test_a_conversion_with_another_frame_packing_is_not_resumed(tmp_path, monkeypatch, capsys):
     video = slow_video(tmp_path / "in.mp4", 10)
     with monkeypatch.context() as patch:
         patch.setattr("stereoweave.video.reader.StereoVideo", Interrupted)
         assert run(video, tmp_path / "out.mp4", "--position", "0.5") == 130
     capsys.readouterr()
     assert run(video, tmp_path / "out.mp4", "--position", "0.5", "--format", "crossed") == 2
-    assert "found parts begun with --format side_by_side;" in capsys.readouterr().err
+    assert "found parts made with --format side_by_side;" in capsys.readouterr().err
 
 
-def test_a_video_stopped_while_it_is_opened_says_what_it_says_later(tmp_path, monkeypatch, capsys):
+def test_an_interrupt_while_the_video_is_opened_is_reported_in_one_line(tmp_path, monkeypatch, capsys):
     video = write_side_by_side(tmp_path / "in.mp4", example_pairs(2), codec="libx264")
     monkeypatch.setattr("stereoweave.video.reader.StereoVideo", lambda *_: signal.raise_signal(signal.SIGINT))
     assert run(video, tmp_path / "out.mp4", "--depth") == 130
     assert capsys.readouterr().err == f"stereoweave: {tmp_path / 'out.mp4'}: stopped; no part was finished\n"
 
 
-def test_one_frame_is_one_frame(tmp_path, capsys):
+def test_a_video_of_one_frame_is_converted_to_one_frame(tmp_path, capsys):
     video = write_side_by_side(tmp_path / "in.mp4", example_pairs(1), codec="libx264")
     assert run(video, tmp_path / "out.mp4", "--position", "0.5") == 0
     assert capsys.readouterr().out == f"{tmp_path / 'out.mp4'}: 1 frame, 0 cuts\n"

@@ -11,7 +11,7 @@ from stereoweave.errors import StereoweaveError
 from stereoweave.video.parts import Parts, open_parts, parts_folder
 
 
-def test_a_videos_parts_go_when_it_is_done(tmp_path):
+def test_the_parts_are_removed_when_the_video_is_finished(tmp_path):
     video = tmp_path / "video.mp4"
     with open_parts(video, {"position": 0.5}) as parts:
         add(parts, b"first", 1)
@@ -20,7 +20,7 @@ def test_a_videos_parts_go_when_it_is_done(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_others_keep_in_that_folder_stays(tmp_path):
+def test_other_files_in_the_folder_of_parts_are_kept(tmp_path):
     video = tmp_path / "video.mp4"
     parts_folder(video).mkdir()
     (parts_folder(video) / "notes.txt").write_text("mine")
@@ -35,7 +35,7 @@ def test_an_error_before_the_first_part_leaves_nothing(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_after_an_error_the_finished_parts_and_the_last_ones_state_stay(tmp_path):
+def test_an_error_keeps_the_finished_parts_and_the_latest_state(tmp_path):
     video = tmp_path / "video.mp4"
     told = r"^no picture; finished parts are in .*video\.mp4\.parts; rerun the same command to resume$"
     with pytest.raises(StereoweaveError, match=told), open_parts(video, {"position": 0.5}) as parts:
@@ -53,7 +53,7 @@ def test_after_an_error_the_finished_parts_and_the_last_ones_state_stay(tmp_path
         ]
 
 
-def test_parts_without_their_state_count_for_nothing(tmp_path):
+def test_parts_without_a_state_are_discarded(tmp_path):
     video = tmp_path / "video.mp4"
     with pytest.raises(KeyboardInterrupt), open_parts(video, {}) as parts:
         add(parts, b"first", 1)
@@ -72,7 +72,7 @@ def test_parts_of_another_video_are_not_continued(tmp_path):
         raise KeyboardInterrupt
     with (
         pytest.raises(
-            StereoweaveError, match=r"found parts begun with position 0\.5; remove that folder, or give"
+            StereoweaveError, match=r"found parts made with position 0\.5; remove this folder, or rerun"
         ),
         open_parts(video, {"position": 0.25, "model": "small"}),
     ):
@@ -82,19 +82,19 @@ def test_parts_of_another_video_are_not_continued(tmp_path):
 
 @pytest.mark.parametrize("name", ["settings.json", "state-000001.npz"])
 @pytest.mark.parametrize("content", [b"", b"[1, 2", b"PK\x03\x04 no archive"])
-def test_a_damaged_parts_folder_is_to_be_removed(tmp_path, name, content):
+def test_the_remedy_for_damaged_parts_is_to_remove_their_folder(tmp_path, name, content):
     folder = begin(tmp_path / "video.mp4")
     (folder / name).write_bytes(content)
     assert_to_be_removed(tmp_path / "video.mp4", name)
 
 
-def test_parts_without_their_settings_are_to_be_removed(tmp_path):
+def test_the_remedy_for_parts_without_settings_is_to_remove_their_folder(tmp_path):
     folder = begin(tmp_path / "video.mp4")
     (folder / "settings.json").unlink()
     assert_to_be_removed(tmp_path / "video.mp4", "settings.json")
 
 
-def test_a_disk_that_is_full_from_the_start_is_one_line_with_the_file(tmp_path):
+def test_a_disk_that_is_full_from_the_start_is_reported_in_one_line_with_the_file(tmp_path):
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     told = r"settings\.json: expected a file that can be written, found file too large$"
     with pytest.raises(StereoweaveError, match=told):
@@ -111,18 +111,18 @@ def test_a_disk_that_is_full_from_the_start_is_one_line_with_the_file(tmp_path):
     ("value", "told"),
     [(True, "with x"), (False, "without x"), (None, "without x"), (0.5, "with x 0.5")],
 )
-def test_what_a_video_was_begun_with_is_told_as_users_write_it(tmp_path, value, told):
+def test_the_settings_of_existing_parts_are_named_as_users_write_them(tmp_path, value, told):
     video = tmp_path / "video.mp4"
     begin(video, {"x": value})
     with (
-        pytest.raises(StereoweaveError, match=f"found parts begun {told}; "),
+        pytest.raises(StereoweaveError, match=f"found parts made {told}; "),
         open_parts(video, {"x": "else"}),
     ):
         pass
 
 
 def begin(video: Path, settings: dict[str, object] | None = None) -> Path:
-    """The folder of a video that was interrupted after one part."""
+    """Interrupt a video after one part and return the folder of its parts."""
     with pytest.raises(KeyboardInterrupt), open_parts(video, settings or {}) as parts:
         add(parts, b"first", 1)
         raise KeyboardInterrupt

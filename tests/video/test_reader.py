@@ -30,7 +30,7 @@ SPOILT = "decoded from a damaged frame before it"
 
 
 def assert_eyes(frames, pairs, tolerance=0.0):
-    """Every eye is the expected one, or on the mean of its values at most `tolerance` levels away."""
+    """Assert that each eye differs from the expected image by at most `tolerance` levels on average."""
     frames = list(frames)
     assert len(frames) == len(pairs)
     for frame, expected in zip(frames, pairs, strict=True):
@@ -74,7 +74,7 @@ def test_each_frame_packing_gives_both_eyes_at_full_size(tmp_path, format):
 
 
 @pytest.mark.parametrize("format", ["side_by_side", "side_by_side_half", "top_bottom", "top_bottom_half"])
-def test_a_frame_packing_that_nobody_names_is_seen(tmp_path, format):
+def test_an_undeclared_frame_packing_is_detected(tmp_path, format):
     pairs = example_pairs(5)
     path = write_side_by_side(tmp_path / "video.mkv", pairs, layout=format, codec="ffv1")
     lost_in_half = 3.0 if format.endswith("half") else 0.0
@@ -96,16 +96,16 @@ def test_a_frame_packing_that_nobody_names_is_seen(tmp_path, format):
         ("sbs/video_TB.mkv", 640, 960, "top_bottom"),
     ],
 )
-def test_the_name_says_what_cannot_be_seen(name, width, height, format):
+def test_the_file_name_decides_if_the_images_do_not(name, width, height, format):
     assert detect_layout(name, [np.full((height, width, 3), 90, np.uint8)]) == format
 
 
-def test_a_name_that_means_something_else_is_not_believed(tmp_path):
+def test_a_misleading_file_name_is_ignored(tmp_path):
     path = write_video(tmp_path / "video_LR.mkv", [left for left, _ in example_pairs(3)])
     assert "do not resemble each other" in refusal(path)
 
 
-def test_what_the_container_declares_is_believed(tmp_path):
+def test_the_frame_packing_that_the_container_declares_is_used(tmp_path):
     pairs = flat_pairs(3)
     for mode, format in (("right_left", "crossed"), ("left_right", "side_by_side"), ("top_bottom",) * 2):
         path = tmp_path / f"{mode}.mkv"
@@ -113,7 +113,7 @@ def test_what_the_container_declares_is_believed(tmp_path):
         assert_eyes(open_video([path]).frames(), pairs)
 
 
-def test_what_the_frames_of_h264_declare_is_believed(tmp_path):
+def test_the_frame_packing_that_h264_frames_declare_is_used(tmp_path):
     pairs = flat_pairs(3)
     path = tmp_path / "video.mp4"
     options = {"x264-params": "frame-packing=3"}
@@ -121,7 +121,7 @@ def test_what_the_frames_of_h264_declare_is_believed(tmp_path):
     assert_eyes(open_video([path]).frames(), pairs, tolerance=1.5)
 
 
-def test_a_declared_frame_packing_that_is_not_read_is_named(tmp_path):
+def test_an_unsupported_declared_frame_packing_is_named(tmp_path):
     path = write_side_by_side(
         tmp_path / "video.mkv", flat_pairs(2), stereo_mode="row_interleaved_lr", codec="ffv1"
     )
@@ -130,7 +130,7 @@ def test_a_declared_frame_packing_that_is_not_read_is_named(tmp_path):
     assert open_video([path], "side_by_side").frame_count == 2
 
 
-def test_a_video_that_is_not_3d_is_refused_with_what_to_do(tmp_path):
+def test_a_video_that_is_not_3d_is_refused_with_a_remedy(tmp_path):
     path = write_video(tmp_path / "video.mkv", [left for left, _ in example_pairs(5)])
     message = refusal(path)
     assert message.startswith(f"{path}: expected 3-D video")
@@ -139,12 +139,12 @@ def test_a_video_that_is_not_3d_is_refused_with_what_to_do(tmp_path):
     assert open_video([path], "side_by_side_half").size_px == (160, 96)
 
 
-def test_a_plain_video_is_called_plain(tmp_path):
+def test_a_plain_video_is_refused_as_too_plain(tmp_path):
     path = write_side_by_side(tmp_path / "video.mkv", flat_pairs(2))
     assert "too plain" in refusal(path)
 
 
-def test_two_views_resemble_each_other_and_other_pictures_do_not():
+def test_only_two_views_of_one_scene_resemble_each_other():
     ((left, right),) = example_pairs(1, width=320, height=240)
     assert measure_resemblance(left, left) == pytest.approx(1, abs=0.001)
     assert measure_resemblance(left, right) > 0.6
@@ -153,7 +153,7 @@ def test_two_views_resemble_each_other_and_other_pictures_do_not():
     assert np.isnan(measure_resemblance(left * 0, left))
 
 
-def test_an_odd_width_is_refused_side_by_side_and_taken_top_to_bottom(tmp_path):
+def test_an_odd_width_is_refused_side_by_side_and_accepted_top_bottom(tmp_path):
     path = write_video(tmp_path / "video.mkv", [np.zeros((96, 161, 3), np.uint8)], codec="ffv1")
     for format in ("side_by_side", "side_by_side_half", "crossed"):
         message = refusal(path, format=format)
@@ -167,7 +167,7 @@ def test_an_odd_width_is_refused_side_by_side_and_taken_top_to_bottom(tmp_path):
     )
 
 
-def test_frame_times_are_the_files_own_counted_from_its_first_frame(tmp_path):
+def test_frame_times_are_relative_to_the_first_frame(tmp_path):
     times_ms = [2000, 2040, 2107, 2140, 2900]
     for name in ("video.mkv", "video.mp4"):
         path = write_side_by_side(
@@ -180,13 +180,13 @@ def test_frame_times_are_the_files_own_counted_from_its_first_frame(tmp_path):
         assert video.rate == Fraction(4000, 900)
 
 
-def test_a_damaged_frame_is_bridged_and_those_made_from_it_are_marked(tmp_path):
+def test_a_damaged_frame_is_bridged_and_frames_decoded_from_it_are_marked(tmp_path):
     path = write_side_by_side(tmp_path / "video.mkv", example_pairs(30))
     whole = list(open_video([path]).frames())
     assert not any(frame.problem for frame in whole)
     video = open_video([damage(path, 14)])
     frames = list(video.frames())
-    # Every twelfth frame of MPEG-4 stands for itself, unless told otherwise.
+    # By default, every twelfth frame of MPEG-4 is a key frame.
     assert problems(video) == {14: BEFORE} | dict.fromkeys(range(15, 24), SPOILT)
     assert_eyes([frames[14]], [whole[13][:2]])
     assert [frame.time for frame in frames] == [frame.time for frame in whole]
@@ -209,12 +209,12 @@ def test_a_run_from_the_middle_gives_the_frames_of_a_full_run(tmp_path, codec):
     assert list(video.frames(20)) == []
 
 
-def test_where_every_frame_stands_for_itself_only_the_damaged_one_is_replaced(tmp_path):
+def test_only_damaged_frames_are_replaced_if_all_are_key_frames(tmp_path):
     path = write_side_by_side(tmp_path / "video.mkv", example_pairs(8), codec="mjpeg")
     assert problems(open_video([damage(path, 3, 4)])) == {3: BEFORE, 4: BEFORE}
 
 
-def test_for_a_damaged_first_frame_the_one_after_it_stands_in(tmp_path):
+def test_a_damaged_first_frame_is_replaced_by_the_next_one(tmp_path):
     path = damage(write_side_by_side(tmp_path / "video.mkv", example_pairs(5), codec="mjpeg"), 0)
     video = open_video([path])
     frames = list(video.frames())
@@ -223,28 +223,28 @@ def test_for_a_damaged_first_frame_the_one_after_it_stands_in(tmp_path):
     assert_same(video.frames(1), frames[1:])
 
 
-def test_a_video_that_breaks_off_is_read_so_far_and_says_so(tmp_path):
+def test_a_truncated_video_is_read_to_its_end_and_reported(tmp_path):
     path = truncate(write_side_by_side(tmp_path / "video.mkv", example_pairs(30), codec="ffv1"), 0.5)
     video = open_video([path])
     assert 10 < video.frame_count < 20
     [(last, problem)] = problems(video).items()
     assert last == video.frame_count - 1
-    assert problem == f"{path} breaks off after this frame (it claims to last 1.2 s)"
+    assert problem == f"{path} breaks off after this frame (its declared duration is 1.2 s)"
 
 
-def test_an_mp4_that_was_cut_off_cannot_be_opened_and_says_why(tmp_path):
+def test_a_truncated_mp4_is_refused_with_the_reason(tmp_path):
     path = truncate(write_side_by_side(tmp_path / "video.mp4", example_pairs(10)), 0.6)
-    assert "it lost its index" in refusal(path)
+    assert "its index is lost" in refusal(path)
 
 
-def test_only_what_begins_as_an_mp4_has_lost_its_index(tmp_path):
+def test_only_a_file_that_begins_as_an_mp4_is_reported_as_cut_off(tmp_path):
     (tmp_path / "text.mp4").write_text("no video\n" * 100)
     (tmp_path / "empty.mp4").touch()
     assert "index" not in refusal(tmp_path / "text.mp4")
     assert refusal(tmp_path / "empty.mp4").endswith("empty.mp4: expected a video, found an empty file")
 
 
-def test_what_is_no_video_is_named_in_one_line(tmp_path):
+def test_a_path_without_a_video_is_refused_in_one_line(tmp_path):
     (tmp_path / "text.mkv").write_text("no video\n" * 100)
     (tmp_path / "empty").mkdir()
     for name in ("text.mkv", "missing.mp4", "empty", "frames_*.png"):
@@ -253,7 +253,7 @@ def test_what_is_no_video_is_named_in_one_line(tmp_path):
     assert "index" not in refusal(tmp_path / "missing.mp4")
 
 
-def test_frames_without_times_of_their_own_follow_each_other_at_the_videos_rate(tmp_path):
+def test_frames_without_time_stamps_are_timed_by_the_frame_rate(tmp_path):
     pairs = example_pairs(9)
     for name, options in (("video.avi", {"bf": "2"}), ("video.m4v", {}), ("video.h264", {})):
         codec = "libx264" if name.endswith("h264") else "mpeg4"
@@ -263,11 +263,11 @@ def test_frames_without_times_of_their_own_follow_each_other_at_the_videos_rate(
         assert [frame.time for frame in frames] == [Fraction(index, 25) for index in range(9)]
 
 
-MOVED = "its time stamp was missing or a duplicate: it is shown slightly later"
+MOVED = "its time stamp was missing or a duplicate, so it is shown slightly later"
 
 
 def restamped(path, stamps_ms):
-    """A video with these time stamps, in a container that holds equal ones too."""
+    """Write a video with these time stamps, which may repeat, and return its path."""
     source = write_side_by_side(path.with_name("source.mkv"), example_pairs(len(stamps_ms)), codec="mjpeg")
     with av.open(str(source)) as old, av.open(str(path), "w") as new:
         stream = new.add_stream_from_template(old.streams.video[0], opaque=True)
@@ -280,7 +280,7 @@ def restamped(path, stamps_ms):
     return path
 
 
-def test_a_repeated_time_stamp_moves_its_frame_alone(tmp_path):
+def test_a_repeated_time_stamp_delays_only_its_own_frame(tmp_path):
     video = open_video([restamped(tmp_path / "video.mkv", [0, 70, 70, 90, 240])])
     times_ms = [1000 * frame.time for frame in video.frames()]
     assert times_ms == [0, 70, 80, 90, 240]  # halfway to 90
@@ -289,31 +289,31 @@ def test_a_repeated_time_stamp_moves_its_frame_alone(tmp_path):
     assert_same(video.frames(2), list(video.frames())[2:])
 
 
-def test_a_repeat_goes_one_frame_on_where_there_is_room():
+def test_a_duplicate_is_delayed_by_one_frame_if_there_is_room():
     assert _separate_duplicates([0, 40, 40, 200, 200], frame_steps=40) == (
         array("q", [0, 40, 80, 200, 240]),
         [2, 4],
     )
 
 
-def test_steps_rise_where_there_is_no_room_between_repeated_stamps():
+def test_times_increase_even_without_room_between_duplicates():
     steps, moved = _separate_duplicates([0, 5, 5, 5, 6, 9], frame_steps=4)
     assert list(steps) == [0, 5, 6, 7, 8, 9]
     assert moved == [2, 3]
 
 
-def test_a_missing_time_stamp_is_taken_for_that_of_the_frame_before():
+def test_a_missing_time_stamp_is_replaced_by_the_previous_one():
     assert _fill_missing([None, 40, None, 120]) == [40, 40, 40, 120]
 
 
 @pytest.mark.parametrize(("key_every", "spoilt"), [("1", []), ("5", [4])])
-def test_a_frame_lost_where_there_are_no_times_is_the_one_that_is_bridged(tmp_path, key_every, spoilt):
+def test_a_frame_lost_without_time_stamps_is_the_one_that_is_bridged(tmp_path, key_every, spoilt):
     options = {"bf": "0", "g": key_every}
     path = write_side_by_side(tmp_path / "a.h264", example_pairs(9), codec="libx264", options=options)
     whole = list(open_video([path]).frames())
     with av.open(str(path)) as container:
         bodies = [bytes(packet) for packet in container.demux(video=0)]
-    # The parameter sets and the first byte of the slice stay, so that it still counts as a frame.
+    # The parameter sets and the first byte of the slice are kept, so that the packet still counts as a frame.
     sliced = bodies[3].rindex(b"\0\0\1") + 4
     spoiled = bodies[3][:sliced] + b"\xff" * (len(bodies[3]) - sliced)
     path.write_bytes(path.read_bytes().replace(bodies[3], spoiled))
@@ -322,15 +322,15 @@ def test_a_frame_lost_where_there_are_no_times_is_the_one_that_is_bridged(tmp_pa
     assert_same(list(video.frames())[5:], whole[5:])
 
 
-def test_a_frame_lost_among_those_coded_out_of_turn_is_noticed_at_the_next_key_frame():
-    # In the file I0 P1 B2 B3 P4 I5 P6, of which B3 is lost.
+def test_with_b_frames_a_lost_frame_is_noticed_at_the_next_key_frame():
+    # The file contains I0 P1 B2 B3 P4 I5 P6, and B3 is lost.
     shown = [SimpleNamespace(opaque=rank, key_frame=rank in (0, 5)) for rank in (0, 2, 1, 4, 5, 6)]
     decoder = SimpleNamespace(codec_context=SimpleNamespace(has_b_frames=True))
     assert [number for number, _ in _number_by_rank(iter(shown), decoder)] == [0, 1, 2, 3, 5, 6]
 
 
-def test_a_folder_of_pictures_is_a_video_in_counting_order(tmp_path):
-    pairs = example_pairs(5)  # numbers 8 to 12: in the order of letters 10 would come first
+def test_a_folder_of_pictures_is_a_video_in_numerical_order(tmp_path):
+    pairs = example_pairs(5)  # numbers 8 to 12: in alphabetical order, 10 would come first
     write_pictures(tmp_path / "frames", "f{}.png", [packed(*pair) for pair in pairs])
     (tmp_path / "frames" / "notes.txt").write_text("no picture")
     for path in (tmp_path / "frames", tmp_path / "frames" / "f*.png"):
@@ -369,16 +369,16 @@ def test_two_videos_are_the_two_eyes_with_the_sound_of_the_one_that_has_it(tmp_p
     assert_eyes(video.frames(), pairs)
 
 
-def test_the_shorter_of_two_videos_ends_both_and_it_is_said(tmp_path):
+def test_two_videos_end_with_the_shorter_one_and_the_rest_is_reported(tmp_path):
     pairs = example_pairs(6)
     left = write_video(tmp_path / "left.mkv", [left for left, _ in pairs])
     right = write_video(tmp_path / "right.mkv", [right for _, right in pairs[:4]])
     video = open_video([left, right])
     assert video.frame_count == 4
-    assert problems(video) == {3: f"{left} has 2 frames more than the other video"}
+    assert problems(video) == {3: f"{left} has 2 more frames than the other video"}
 
 
-def test_a_damaged_frame_of_one_eye_is_told_from_the_other(tmp_path):
+def test_a_damaged_frame_is_reported_with_the_name_of_its_video(tmp_path):
     pairs = example_pairs(6)
     left = write_video(tmp_path / "left.mkv", [left for left, _ in pairs], codec="mjpeg")
     right = write_video(tmp_path / "right.mkv", [right for _, right in pairs], codec="mjpeg")
@@ -386,32 +386,32 @@ def test_a_damaged_frame_of_one_eye_is_told_from_the_other(tmp_path):
     assert problems(open_video([left, right])) == {2: f"{right}: {BEFORE}"}
 
 
-def test_two_videos_that_do_not_go_together_are_refused(tmp_path):
+def test_mismatched_videos_are_refused(tmp_path):
     lefts = [left for left, _ in example_pairs(8)]
     left = write_video(tmp_path / "left.mkv", lefts)
     low = write_video(tmp_path / "low.mkv", [image[:64] for image in lefts])
     slow = write_video(tmp_path / "slow.mkv", lefts, times_ms=[50 * index for index in range(8)])
     assert "160x96" in refusal(left, low)
     assert "160x64" in refusal(left, low)
-    assert "one frame rate" in refusal(left, slow)
+    assert "the same frame rate" in refusal(left, slow)
     assert "0.350 s" in refusal(left, slow)
 
 
 @pytest.mark.parametrize(("colorspace", "color_range"), [(1, 1), (1, 2), (5, 1), (5, 2), (2, 0)])
-def test_colours_come_out_as_they_went_in(tmp_path, colorspace, color_range):
+def test_colours_are_decoded_as_they_were_encoded(tmp_path, colorspace, color_range):
     pairs = flat_pairs(2)
     path = write_side_by_side(
         tmp_path / "video.mkv", pairs, codec="libx264", colorspace=colorspace, color_range=color_range
     )
     for frame, expected in zip(open_video([path], "side_by_side").frames(), pairs, strict=True):
         for eye, image in zip(frame[:2], expected, strict=True):
-            # Where the eyes meet, their colours mix in the video, which has one sample for four pixels.
+            # Where the eyes meet, their colours mix, because the video has one sample for four pixels.
             np.testing.assert_allclose(eye[8:-8, 8:-8], image[8:-8, 8:-8], atol=2)
 
 
-def test_untagged_colours_of_a_large_picture_are_taken_for_those_of_bt709(tmp_path):
-    # As players do. Green of BT.601 (Y 145, Cb 54, Cr 34) is shown paler by them: 1.164 * 129 - 0.213 * -74
-    # - 0.533 * -94 = 216 instead of 255.
+def test_untagged_colours_of_a_large_video_count_as_bt709(tmp_path):
+    # As in players, green of BT.601 (Y 145, Cb 54, Cr 34) becomes paler if it is decoded as BT.709:
+    # 1.164 * 129 - 0.213 * -74 - 0.533 * -94 = 216 instead of 255.
     green = np.zeros((64, 1280, 3), np.uint8)
     green[..., 1] = 255
     untagged = write_video(tmp_path / "video.mkv", [green], codec="libx264")
@@ -419,15 +419,15 @@ def test_untagged_colours_of_a_large_picture_are_taken_for_those_of_bt709(tmp_pa
     assert frame.left[..., 1].mean() == pytest.approx(216, abs=2)
 
 
-def test_colours_are_not_darkened_on_the_way_from_fewer_colour_samples(tmp_path):
+def test_colours_are_not_darkened_by_the_conversion_from_fewer_samples(tmp_path):
     pairs = example_pairs(2)
     path = write_side_by_side(tmp_path / "video.mkv", pairs, codec="libx264", options={"crf": "1"})
     frame = next(open_video([path]).frames())
-    # FFmpeg's quick conversion loses 1.1 to 1.5 levels here.
+    # The fast conversion of FFmpeg loses 1.1 to 1.5 levels here.
     assert np.abs((frame.left.astype(float) - pairs[0][0]).mean(axis=(0, 1))).max() < 0.5
 
 
-def test_a_video_that_lies_on_its_side_is_turned_upright(tmp_path):
+def test_a_rotated_video_is_turned_upright(tmp_path):
     pairs = flat_pairs(2)
     lying = [np.ascontiguousarray(np.rot90(packed(*pair), k=-1)) for pair in pairs]
     path = write_video(tmp_path / "video.mp4", lying, codec="libx264", rotation=90)
@@ -436,7 +436,7 @@ def test_a_video_that_lies_on_its_side_is_turned_upright(tmp_path):
     assert_eyes(video.frames(), pairs, tolerance=1.5)
 
 
-def test_a_name_with_brackets_is_a_file_where_there_is_one(tmp_path):
+def test_a_name_with_brackets_is_a_file_if_that_file_exists(tmp_path):
     path = write_side_by_side(tmp_path / "video [3D].mkv", example_pairs(2))
     assert open_video([path]).frame_count == 2
 
@@ -449,7 +449,7 @@ def test_without_pyav_the_extra_is_named_and_pictures_still_work(tmp_path, monke
     assert_eyes(open_video([tmp_path / "frames"], "side_by_side").frames(), flat_pairs(2))
 
 
-def test_what_cannot_be_meant_is_refused(tmp_path):
+def test_invalid_arguments_are_refused(tmp_path):
     path = write_side_by_side(tmp_path / "video.mkv", flat_pairs(1))
     assert "'sideways'" in refusal(path, format="sideways")
     assert "found 3" in refusal(path, path, path)
@@ -457,7 +457,7 @@ def test_what_cannot_be_meant_is_refused(tmp_path):
     assert "without a frame packing" in refusal(path, path, format="top_bottom")
 
 
-def test_frames_are_read_one_after_the_other_and_files_closed(tmp_path):
+def test_frames_can_be_read_twice_at_the_same_time(tmp_path):
     path = write_side_by_side(tmp_path / "video.mkv", flat_pairs(4))
     video = open_video([path], "side_by_side")
     first, second = video.frames(), video.frames()

@@ -1,4 +1,4 @@
-"""Each video is a list of (left, right, estimate); pictures are random textures, and noise has a seed."""
+"""Temporal filter of videos, each a list of (left, right, estimate) with random textures and seeded noise."""
 
 import threading
 
@@ -24,7 +24,7 @@ from stereoweave.video.temporal_filter import (
 )
 
 HEIGHT, WIDTH = 120, 176
-# Odd places are in no neighbourhood that drift is measured by.
+# A pixel with odd coordinates is not among the neighbours from which drift is measured.
 PIXEL = (61, 83)
 
 
@@ -65,14 +65,17 @@ def at_rest(rng, estimates):
 
 
 def square_video(rng, frames, velocity_px, nearing_px=0.0):
-    """A textured square of 48 px with a disparity of 30 px at first, over a plane of 10 px; and the truth."""
+    """Return a video of a textured square in front of a plane, its true disparities, and the square's masks.
+
+    The square is 48 px wide and begins at a disparity of 30 px; the plane is at 10 px.
+    """
     back, front = texture(rng), texture(rng, 48, 48)
     video, truths_px, masks = [], [], []
     for number in range(frames):
         near_px = 30 + nearing_px * number
         images, maps, squares = [], [], []
         for position in (0, 1):
-            # What passes is cut out at whole pixels of both views.
+            # The square lies on whole pixels in both views.
             column = 60 + round(velocity_px * number - position * (near_px - 10))
             image, square = back.copy(), np.zeros((HEIGHT, WIDTH), bool)
             image[36:84, column : column + 48], square[36:84, column : column + 48] = front, True
@@ -86,7 +89,7 @@ def square_video(rng, frames, velocity_px, nearing_px=0.0):
     return video, np.stack(truths_px), np.stack(masks)
 
 
-def test_the_first_frame_is_its_own_estimate(rng):
+def test_the_first_estimate_is_unchanged(rng):
     only = estimate(rng.uniform(0, 40, (HEIGHT, WIDTH)))
     (first,), temporal_filter = filter_all(at_rest(rng, [only]))
     np.testing.assert_array_equal(first.disparity_px, only.disparity_px)
@@ -101,21 +104,21 @@ def test_a_pixel_at_rest_becomes_the_mean_of_its_frames(rng):
     assert (np.delete(found.reshape(4, -1), PIXEL[0] * WIDTH + PIXEL[1], axis=1) == 10).all()
 
 
-def test_what_a_surface_changes_in_common_is_followed_without_lag(rng):
+def test_a_change_shared_by_a_surface_is_followed_without_lag(rng):
     found = disparities(filter_all(at_rest(rng, [plain(10 + 0.5 * t) for t in range(8)]))[0])
     np.testing.assert_allclose(found[:, 50, 60], 10 + 0.5 * np.arange(8), atol=1e-5)
 
 
-def test_at_rest_a_contradiction_is_outvoted_until_it_has_lasted_as_long(rng):
+def test_at_rest_a_contradiction_is_outvoted_until_it_has_lasted_equally_long(rng):
     video = at_rest(rng, [plain(10), plain(10), *[plain(10, 40)] * 4])
     found = disparities(filter_all(video)[0])
     np.testing.assert_allclose(found[:, *PIXEL], [10, 10, 10, 10, 40, 40], atol=1e-5)
 
 
-def test_what_a_frame_contradicts_is_less_certain(rng):
+def test_a_contradiction_lowers_the_confidence(rng):
     video = at_rest(rng, [plain(10), plain(10, 40), plain(10)])
     found = [each.confidence[PIXEL] for each in filter_all(video)[0]]
-    # One claim of 0.8, then one of nothing; by then the two have cancelled each other.
+    # The contradiction halves the confidence and cancels the first frame: the third starts a new mean.
     np.testing.assert_allclose(found, [0.8, 0.4, 0.8], atol=1e-6)
 
 
@@ -138,7 +141,7 @@ def test_flicker_of_a_still_video_at_least_halves_in_both_views(rng):
 
 
 @pytest.mark.parametrize(("velocity_px", "nearing_px"), [(4, 0), (-3, 0), (1, 0), (2, 1)])
-def test_nothing_trails_behind_what_moves(rng, velocity_px, nearing_px):
+def test_moving_objects_leave_no_trail(rng, velocity_px, nearing_px):
     video, truth_px, moving = square_video(rng, 10, velocity_px, nearing_px)
     found = disparities(filter_all(video)[0])
     error_px = np.abs(found - truth_px)[1:]
@@ -149,7 +152,7 @@ def test_nothing_trails_behind_what_moves(rng, velocity_px, nearing_px):
     assert error_px.mean() < 0.7 * error_by_frame_px.mean()
 
 
-def test_what_comes_nearer_is_followed_without_lag(rng):
+def test_an_approaching_object_is_followed_without_lag(rng):
     video, truth_px, moving = square_video(rng, 12, 0, nearing_px=0.5)
     found = disparities(filter_all(video)[0])
     inside = cv2.erode(moving[0].astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
@@ -159,7 +162,7 @@ def test_what_comes_nearer_is_followed_without_lag(rng):
 
 def test_a_pan_is_filtered_along_its_motion(rng):
     wide = texture(rng, HEIGHT, WIDTH + 60)
-    # Stairs, which are elsewhere in every frame.
+    # Steps in disparity, which move with the pan.
     wide_px = 10.0 + 6 * (np.arange(WIDTH + 60) // 12 % 2)[None].repeat(HEIGHT, 0)
     video, truths_px = [], []
     for number in range(10):
@@ -178,7 +181,7 @@ def test_a_pan_is_filtered_along_its_motion(rng):
     assert error_px < 0.6 * np.abs(disparities([each for *_, each in video]) - truths_px)[inner].mean()
 
 
-def test_a_cut_starts_anew_and_is_counted(rng):
+def test_a_cut_restarts_the_filter_and_is_counted(rng):
     before = at_rest(rng, [plain(10)] * 3)
     after = at_rest(rng, [plain(10, 10.5), plain(10, 10.5)])
     found, temporal_filter = filter_all(before + after)
@@ -211,13 +214,13 @@ def test_a_cut_between_plain_scenes_shows_in_their_disparity(rng):
     assert temporal_filter.cuts == 1
 
 
-def test_a_thing_that_comes_and_goes_over_plain_ground_is_no_cut(rng):
+def test_an_object_that_comes_and_goes_over_plain_ground_is_not_a_cut(rng):
     video = [plain_with_patch(rng, row, column, 10) for row, column in [(20, 40), (70, 120), (20, 100)]]
     assert filter_all(video)[1].cuts == 0
 
 
 @pytest.mark.parametrize("contrast", [0.25, 0.1])
-def test_a_cut_between_faint_scenes_is_one(rng, contrast):
+def test_a_cut_between_faint_scenes_is_detected(rng, contrast):
     def faint(disparity_px):
         images = [cv2.convertScaleAbs(texture(rng), alpha=contrast, beta=100) for _ in range(2)]
         return *images, plain(disparity_px)
@@ -229,7 +232,7 @@ def test_a_cut_between_faint_scenes_is_one(rng, contrast):
 
 
 @pytest.mark.parametrize("jump_px", [3, 6, -6])
-def test_what_moves_in_the_right_view_alone_is_not_outvoted(rng, jump_px):
+def test_motion_in_only_the_right_view_is_not_outvoted(rng, jump_px):
     left, wide = texture(rng), texture(rng, HEIGHT, WIDTH + 20)
     near_px = np.array([20, 20, 20, 20 + jump_px])
     rights = [wide[:, 10 + shift_px : 10 + shift_px + WIDTH].copy() for shift_px in near_px - 20]
@@ -239,7 +242,7 @@ def test_what_moves_in_the_right_view_alone_is_not_outvoted(rng, jump_px):
     assert temporal_filter.cuts == 0
 
 
-def test_a_small_thing_that_moves_in_the_right_view_alone_is_not_outvoted(rng):
+def test_a_small_object_that_moves_only_in_the_right_view_is_not_outvoted(rng):
     ground, thing = texture(rng), texture(rng, 12, 12)
     video, square = [], np.s_[60:72, 100:112]
     for near_px in range(12, 33, 3):
@@ -254,7 +257,7 @@ def test_a_small_thing_that_moves_in_the_right_view_alone_is_not_outvoted(rng):
 
 
 @pytest.mark.parametrize(("gain", "offset_levels"), [(0.6, 0), (0.8, 50), (1.0, -20)])
-def test_a_fade_is_no_cut_and_keeps_what_was_found(rng, gain, offset_levels):
+def test_a_fade_is_not_a_cut_and_keeps_the_mean(rng, gain, offset_levels):
     left, right = (cv2.convertScaleAbs(texture(rng), alpha=0.6, beta=40) for _ in range(2))
     faded = [np.clip(gain * image + offset_levels, 0, 255).astype(np.uint8) for image in (left, right)]
     found, temporal_filter = filter_all([(left, right, plain(10, 10.0)), (*faded, plain(10, 10.6))])
@@ -262,7 +265,7 @@ def test_a_fade_is_no_cut_and_keeps_what_was_found(rng, gain, offset_levels):
     np.testing.assert_allclose(found[1].disparity_px[PIXEL], 10.3, atol=1e-5)
 
 
-def test_a_state_goes_on_bit_for_bit(rng, tmp_path):
+def test_a_restored_filter_continues_bit_for_bit(rng, tmp_path):
     video, _, _ = square_video(rng, 6, 3, 1)
     found, temporal_filter = filter_all(video[:3])
     np.savez(tmp_path / "state.npz", **temporal_filter.state())
@@ -279,7 +282,7 @@ def test_a_state_goes_on_bit_for_bit(rng, tmp_path):
     "start", [TemporalFilter, lambda threads: TemporalFilter.from_state(TemporalFilter().state(), threads)]
 )
 @pytest.mark.parametrize("threads", [1, 2])
-def test_no_more_threads_work_than_asked_for(rng, start, threads):
+def test_no_more_threads_run_than_requested(rng, start, threads):
     workers = set()
     temporal_filter = start(threads)
     threading.setprofile(lambda *_: workers.add(threading.get_ident()))
@@ -316,7 +319,7 @@ def test_the_state_does_not_grow_with_the_video(rng):
 
 
 @pytest.mark.parametrize(("height", "width"), [(33, 35), (65, 98), (48, 131)])
-def test_odd_sizes(rng, height, width):
+def test_odd_image_sizes_are_filtered(rng, height, width):
     left, right = texture(rng, height, width), texture(rng, height, width)
     maps_px = 10 + rng.normal(0, 0.2, (6, height, width))
     found = disparities(filter_all([(left, right, estimate(each)) for each in maps_px])[0])
@@ -325,7 +328,7 @@ def test_odd_sizes(rng, height, width):
 
 
 def test_an_estimate_of_another_size_is_refused(rng, without_shape_checks):
-    with pytest.raises(StereoweaveError, match="estimate: expected the size of both pictures, got .90, 91."):
+    with pytest.raises(StereoweaveError, match="estimate: expected the size of both images, found .90, 91."):
         TemporalFilter()(texture(rng), texture(rng), estimate(np.ones((90, 91))))
 
 
@@ -339,7 +342,7 @@ def random_track(rng, shape):
 
 def random_motion(rng, shape):
     half = ((shape[0] + 1) // 2, (shape[1] + 1) // 2)
-    # No halves: NumPy and the kernel need not round them alike.
+    # Exact halves are excluded, because NumPy and the kernel may round them differently.
     to_before_px = rng.integers(-5, 6, (*half, 2)) + rng.uniform(-0.4, 0.4, (*half, 2))
     return Motion(to_before_px.astype(np.float32), rng.random(half) < 0.8, rng.random(half) < 0.5, 1.0)
 
@@ -404,7 +407,7 @@ def plain_blend(new, carried, calm, drift_px):
 
 
 @pytest.mark.parametrize("shape", [(40, 50), (41, 33)])
-def test_the_kernels_equal_the_plain_ones(rng, shape):
+def test_the_kernels_equal_their_plain_versions(rng, shape):
     track, new, motion = random_track(rng, shape), random_track(rng, shape), random_motion(rng, shape)
     carried = empty_track(shape)
     carry(new.disparity_px, track, motion, carried)

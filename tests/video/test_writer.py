@@ -1,4 +1,4 @@
-"""Videos in parts and whole: times, sound, colours and marks come out as they went in."""
+"""Videos written in parts and joined: times, sound, colours and frame packing are preserved."""
 
 from collections.abc import Sequence
 from fractions import Fraction
@@ -14,7 +14,7 @@ from video_examples import example_pairs, write_side_by_side
 from stereoweave.errors import StereoweaveError
 from stereoweave.video.writer import GREY16, H264, Packing, Recorder, check_container
 
-# What FFmpeg needs to give back colours to the level.
+# Flags with which FFmpeg decodes colours exactly.
 EXACT = Interpolation.BICUBIC | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
 NTSC = Fraction(30000, 1001)
 FLAT_RGB = [(200, 30, 40), (20, 180, 60), (128, 128, 128), (255, 255, 255), (0, 0, 0), (30, 40, 220)]
@@ -32,7 +32,7 @@ def make(
     sound: Path | None = None,
     parts: int = 2,
 ) -> Path:
-    """The video of these pictures, written in so many parts."""
+    """Write a video of these images in several parts, and return its path."""
     files = [video.with_name(f"{number}.nut") for number in range(parts)]
     for file, chosen in zip(files, np.array_split(np.arange(len(shown)), parts), strict=True):
         recorder.write_part(file, [shown[index] for index in chosen])
@@ -59,7 +59,7 @@ def first_frame(video: Path) -> av.VideoFrame:
 
 
 def sound_of(video: Path) -> list[list[tuple[Fraction, bytes]]]:
-    """Time and content of each packet, for each stream of sound."""
+    """Return the time and content of every packet, per audio stream."""
     with av.open(str(video)) as container:
         found: dict[int, list[tuple[Fraction, bytes]]] = {
             stream.index: [] for stream in container.streams.audio
@@ -72,7 +72,7 @@ def sound_of(video: Path) -> list[list[tuple[Fraction, bytes]]]:
 
 @pytest.mark.parametrize("ending", [".mp4", ".mov"])
 @pytest.mark.parametrize("time_base", [Fraction(1, 90_000), Fraction(1001, 30_000), Fraction(1, 7)])
-def test_frames_are_shown_at_their_very_times_even_where_parts_meet(tmp_path, ending, time_base):
+def test_frame_times_are_exact_even_across_parts(tmp_path, ending, time_base):
     steps = [0, 1, 3, 4, 9, 10, 11, 12, 20, 21]
     times_s = [step * time_base for step in steps]
     writing = recorder(time_base=time_base, rate=len(steps) / times_s[-1])
@@ -92,7 +92,7 @@ def test_the_last_frame_is_shown_as_long_as_the_others(tmp_path):
         assert stream.duration * stream.time_base == 6 / NTSC
 
 
-def test_an_odd_picture_gets_its_last_row_and_column_once_more(tmp_path):
+def test_an_odd_size_is_padded_with_the_last_row_and_column(tmp_path):
     picture = np.full((35, 37, 3), 40, np.uint8)
     picture[-1], picture[:, -1] = 200, 200
     video = make(tmp_path / "video.mp4", [(Fraction(0), picture)], recorder(), parts=1)
@@ -103,11 +103,12 @@ def test_an_odd_picture_gets_its_last_row_and_column_once_more(tmp_path):
     np.testing.assert_allclose(levels[5:30, 5:30], 40, atol=12)
 
 
-def test_colours_come_back_within_two_levels_and_are_said_to_be_those_of_hd_video(tmp_path):
+def test_colours_are_kept_within_two_levels_and_tagged_as_hd_video(tmp_path):
     picture = np.repeat(np.array(FLAT_RGB, np.uint8)[None], 64, 0).repeat(32, 1)
     video = make(tmp_path / "video.mp4", [(Fraction(0), picture)], recorder(), parts=1)
     frame = first_frame(video)
-    # ITU-T H.273: 1 is BT.709 as a matrix, as primaries and as a curve; FFmpeg's 1 is the limited range.
+    # In ITU-T H.273, 1 is BT.709 for the matrix, the primaries and the transfer curve. In FFmpeg, 1 is the
+    # limited range.
     assert (frame.colorspace, frame.color_primaries, frame.color_trc, frame.color_range) == (1, 1, 1, 1)
     seen = frame.to_ndarray(format="rgb24", interpolation=EXACT).astype(int)
     for index, rgb in enumerate(FLAT_RGB):
@@ -115,7 +116,7 @@ def test_colours_come_back_within_two_levels_and_are_said_to_be_those_of_hd_vide
         assert np.abs(patch - np.array(rgb)).max() <= 2, rgb
 
 
-def test_16_bit_grey_comes_back_exactly(tmp_path, rng):
+def test_16_bit_grey_is_lossless(tmp_path, rng):
     grey = rng.integers(0, 65536, (3, 33, 45), dtype=np.uint16)
     video = make(
         tmp_path / "video.mkv",
@@ -131,7 +132,7 @@ def test_16_bit_grey_comes_back_exactly(tmp_path, rng):
 
 @pytest.mark.parametrize("ending", [".mp4", ".mkv"])
 @pytest.mark.parametrize(("number", "kind"), [(3, 1), (4, 2)])  # AVStereo3D: 1 side by side, 2 top and bottom
-def test_players_are_told_how_two_views_share_a_picture(tmp_path, ending, number, kind):
+def test_the_frame_packing_is_declared_for_players(tmp_path, ending, number, kind):
     word = {3: "left_right", 4: "top_bottom"}[number]
     video = make(
         tmp_path / f"video{ending}",
@@ -144,7 +145,7 @@ def test_players_are_told_how_two_views_share_a_picture(tmp_path, ending, number
         assert container.streams.video[0].metadata.get("stereo_mode") == (word if ending == ".mkv" else None)
 
 
-def test_crossed_views_are_marked_where_that_can_be_said(tmp_path):
+def test_crossed_views_are_declared_only_in_matroska(tmp_path):
     shown = list(zip(even_times(2), pictures(2), strict=True))
     writing = recorder(packing=Packing("right_left", None))
     assert Type.STEREO3D not in first_frame(make(tmp_path / "video.mp4", shown, writing)).side_data
@@ -168,13 +169,13 @@ def test_sound_is_copied_bit_for_bit_at_its_times(tmp_path, source, target, off_
     [before], [after] = sound_of(original), sound_of(video)
     assert len(before) > 15
     assert [content for _, content in after] == [content for _, content in before]
-    # The encoder's run-up lies before 0; nothing is shifted for it.
+    # The priming samples of the encoder lie before 0, and nothing is shifted to make room for them.
     assert before[0][0] < 0
     assert max(abs(then - now) for (then, _), (now, _) in zip(before, after, strict=True)) <= off_s
     assert frame_times(video)[0] == 0
 
 
-def test_all_streams_of_sound_are_kept_with_their_languages(tmp_path):
+def test_all_audio_streams_are_kept_with_their_languages(tmp_path):
     original = two_languages(tmp_path / "in.mkv")
     video = make(
         tmp_path / "out.mkv",
@@ -188,7 +189,7 @@ def test_all_streams_of_sound_are_kept_with_their_languages(tmp_path):
         assert [stream.codec_context.name for stream in container.streams.audio] == ["opus", "flac"]
 
 
-def test_pictures_and_sound_stay_in_step_where_the_pictures_begin_late(tmp_path):
+def test_sound_stays_in_sync_if_the_images_begin_late(tmp_path):
     original = write_side_by_side(tmp_path / "in.mp4", example_pairs(3), times_ms=[400, 440, 480], sound=True)
     shown = list(zip(even_times(3, Fraction(25)), pictures(3), strict=True))
     video = make(
@@ -207,26 +208,27 @@ def test_a_late_start_is_kept_exactly(tmp_path, ending):
     assert frame_times(video) == late
 
 
-def test_sound_that_a_container_cannot_hold_is_refused_with_one_that_can(tmp_path):
+def test_sound_that_a_container_cannot_hold_is_refused_with_a_container_that_can(tmp_path):
     original = two_languages(tmp_path / "in.mkv")
     with pytest.raises(
         StereoweaveError,
-        match=r"out\.mov: expected sound that \.mov can hold, found flac, opus in .*in\.mkv; \.mp4 holds it",
+        match=r"out\.mov: expected sound that \.mov can hold, found flac, opus in .*in\.mkv; "
+        r"use \.mp4 instead$",
     ):
         check_container(tmp_path / "out.mov", original)
     check_container(tmp_path / "out.mkv", original)
     assert [path.name for path in tmp_path.iterdir()] == ["in.mkv"]
 
 
-def test_a_name_that_is_no_videos_is_refused():
+def test_a_name_without_a_video_ending_is_refused():
     with pytest.raises(
-        StereoweaveError, match=r"video\.gif: expected the ending of a video, .*, found '\.gif'"
+        StereoweaveError, match=r"video\.gif: expected a file name ending in \.mp4 or .*, found '\.gif'"
     ):
         check_container(Path("video.gif"), None)
 
 
 def two_languages(path: Path) -> Path:
-    """A second of two sounds, Opus in German and FLAC in French, and a picture."""
+    """Write one frame with a second of two audio streams, Opus in German and FLAC in French."""
     with av.open(str(path), "w") as container:
         picture = container.add_stream("mpeg4", rate=25, width=64, height=48, pix_fmt="yuv420p")
         tracks = [container.add_stream(codec, rate=48_000) for codec in ("libopus", "flac")]
