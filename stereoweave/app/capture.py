@@ -1,4 +1,4 @@
-"""Sources of live video: cameras, files and streams, read in step by a thread."""
+"""Sources of live video: cameras, files and streams, read synchronously by a thread."""
 
 import threading
 import time
@@ -19,7 +19,13 @@ _TIMEOUT_S = 10.0
 
 
 class Moment(NamedTuple):
-    """Simultaneous RGB images of all sources, their number from 0, and their time (time.monotonic)."""
+    """RGB images captured from all sources at the same time.
+
+    Attributes:
+        number: Number of the moment, from 0.
+        pictures: One image per source.
+        taken_s: Time of the capture, from `time.monotonic`.
+    """
 
     number: int
     pictures: tuple[Picture, ...]
@@ -27,29 +33,29 @@ class Moment(NamedTuple):
 
 
 class Capture:
-    """One or two sources, read in step by a thread that keeps only the newest moment.
+    """One or two sources, read synchronously by a thread that keeps only the newest moment.
 
-    A video is read at its own frame rate, like a camera.
+    A video file is read at its own frame rate, as if it were a camera.
 
     Args:
-        sources: A source with both views, or two, the left one first. Each is a camera's number, a video
-            file, a stream's address, or a series of pictures such as frame%03d.png.
+        sources: One source with both views, or a left and a right source. Each is the number of a camera, a
+            video file, the address of a stream, or a series of pictures such as frame%03d.png.
 
     Raises:
         FormatError: If a source cannot be opened.
-        StereoweaveError: If there are more than two.
+        StereoweaveError: If there are more than two sources.
     """
 
     def __init__(self, sources: Sequence[str]) -> None:
         if len(sources) > 2:
             raise StereoweaveError(
-                f"expected one SOURCE with both views, or LEFT RIGHT, found {len(sources)}: "
+                f"expected one source with both views, or a left and a right source, found {len(sources)}: "
                 f"{' '.join(sources)}"
             )
         self.name, self.count = " and ".join(sources), len(sources)
         self._captures = [_open_source(source) for source in sources]
         first = self._captures[0]
-        # A picture or a recorded stream has no frame count.
+        # A single picture or a recorded stream has no frame count.
         self._is_recording = first.get(cv2.CAP_PROP_FRAME_COUNT) > 0 or Path(sources[0]).is_file()
         rate = first.get(cv2.CAP_PROP_FPS)
         self._step_s = 1 / (rate if rate > 0 else _DEFAULT_RATE)
@@ -66,13 +72,13 @@ class Capture:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._stopped.set()
-        self._thread.join(timeout=1)  # a camera that hangs ends with the process
+        self._thread.join(timeout=1)  # if a camera hangs, its thread ends with the process
 
     def newest(self, after: int) -> Moment | None:
-        """Wait for the newest moment with a number above `after`; None at the end of a video.
+        """Wait for a moment with a number above `after` and return the newest; None at the end of a video.
 
         Raises:
-            StereoweaveError: If a camera or stream stops, or a video has no frame.
+            StereoweaveError: If a camera or stream stops, or if a video has no frames.
         """
         with self._changed:
             came = self._changed.wait_for(lambda: self._ended or self._has_newer(after), _TIMEOUT_S)
@@ -80,9 +86,9 @@ class Capture:
                 return self._newest
         if came and self._is_recording and after >= 0:
             return None
-        found = "the end of what it gives" if came else f"nothing for {_TIMEOUT_S:g} s"
+        found = "the end of the source" if came else f"nothing for {_TIMEOUT_S:g} s"
         raise StereoweaveError(
-            f"{self.name}: expected frames, found {found} after {after + 1}; is it still connected?"
+            f"{self.name}: expected frames, found {found} after frame {after + 1}; check the connection"
         )
 
     def _has_newer(self, after: int) -> bool:
@@ -107,7 +113,7 @@ class Capture:
                 self._changed.notify_all()
 
     def _read(self) -> tuple[Picture, ...] | None:
-        # Grab all before decoding any, so that two cameras are as close in time as possible.
+        # Grab all images before decoding any, so that two cameras are as close in time as possible.
         if not all([capture.grab() for capture in self._captures]):
             return None
         frames = [capture.retrieve() for capture in self._captures]
@@ -118,19 +124,19 @@ class Capture:
 
 def _open_source(source: str) -> cv2.VideoCapture:
     level = cv2.utils.logging.getLogLevel()
-    # The error below reports a failure; OpenCV would print it too.
+    # The error below reports a failure, which OpenCV would print as well.
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     capture = cv2.VideoCapture(int(source) if source.isdigit() else source)
     cv2.utils.logging.setLogLevel(level)
     if capture.isOpened():
         return capture
     if source.isdigit():
-        found = "no camera of that number that is free"
+        found = "no free camera with that number"
     elif "://" in source:
         found = "no stream at that address"
     else:
-        found = "something else" if Path(source).exists() else "no such file"
+        found = "a file that OpenCV cannot open" if Path(source).exists() else "no such file"
     raise FormatError(
-        f"{source}: expected a camera's number, a video file, the address of a stream, or pictures as "
-        f"frame%03d.png, found {found}"
+        f"{source}: expected the number of a camera, a video file, the address of a stream, or pictures such "
+        f"as frame%03d.png, found {found}"
     )

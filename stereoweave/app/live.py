@@ -1,4 +1,4 @@
-"""Live view of cameras on a local web page: the left image, and its disparity in colour beside it."""
+"""Live view of cameras on a local web page: the left image with its disparity in colour beside it."""
 
 import time
 from collections import deque
@@ -19,7 +19,7 @@ from stereoweave.matching.matcher import Matcher
 from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS, Frame, Picture, detect_layout
 from stereoweave.stereo import StereoCamera, StereoPair
 
-# The share by which the colour range follows that of a new frame; at 1 the colours would flicker.
+# Share of the way that the colour range moves towards the range of a new frame; at 1, colours would flicker.
 _RANGE_SHARE = 0.1
 _RANGE_STEP_PX = 4
 _RATE_FRAMES = 30
@@ -37,7 +37,7 @@ class LiveTally:
     last_s: deque[float] = field(default_factory=lambda: deque(maxlen=_RATE_FRAMES))
 
     def add(self, moment: Moment, now_s: float) -> None:
-        """Count a moment that is shown now."""
+        """Count a moment as shown at the time `now_s`."""
         self.first_s = self.first_s if self.shown else now_s
         self.shown, self.last = self.shown + 1, moment.number
         self.waited_s += now_s - moment.taken_s
@@ -45,17 +45,17 @@ class LiveTally:
 
     @property
     def rate(self) -> float:
-        """Frames per second over the last frames; 0 for a single one."""
+        """Frames per second, averaged over the most recent frames; 0 for a single frame."""
         return _measure_rate(len(self.last_s), self.last_s[-1] - self.last_s[0])
 
     def describe(self) -> str:
-        """Describe the statistics in one line."""
+        """Return the statistics as one line of text."""
         if not self.shown:
-            return "nothing was shown"
+            return "no frame was shown"
         rate = _measure_rate(self.shown, self.last_s[-1] - self.first_s)
         return (
-            f"{self.shown} frames shown of {self.last + 1}, {rate:.1f} a second, "
-            f"{1000 * self.waited_s / self.shown:.0f} ms after they came"
+            f"{self.shown} of {self.last + 1} frames shown, {rate:.1f} per second, "
+            f"{1000 * self.waited_s / self.shown:.0f} ms after capture"
         )
 
 
@@ -71,12 +71,12 @@ def show(  # noqa: PLR0913 - source, output and settings
     """Show captured images and their disparity until the sources end.
 
     Args:
-        capture: The sources.
-        screen: The page to show them on.
-        matcher: The matcher for the disparity.
-        tally: Updated with each frame, so that it is valid even after an error.
-        format: The frame packing of a single source, a name in `PAIR_LAYOUTS`. Default: detected.
-        rig: The calibration to rectify the images with. Default: they are rectified already.
+        capture: Source of the images.
+        screen: Web page that shows the images.
+        matcher: Matcher that estimates the disparity.
+        tally: Statistics, updated with each frame so that they are valid even after an error.
+        format: Frame packing of a single source, a name in `PAIR_LAYOUTS`. Default: detected.
+        rig: Calibration with which to rectify the images. Default: the images are already rectified.
     """
     range_px: tuple[float, float] | None = None
     while moment := capture.newest(tally.last):
@@ -94,7 +94,7 @@ def show(  # noqa: PLR0913 - source, output and settings
 def follow_range(
     range_px: tuple[float, float] | None, disparity_px: Float[np.ndarray, "h w"]
 ) -> tuple[float, float]:
-    """Return the colour range after a frame: a step from the previous one towards the frame's own range."""
+    """Return the colour range for a new frame: the previous range, moved towards the frame's own range."""
     wanted_px = find_colour_range_px(disparity_px[::_RANGE_STEP_PX, ::_RANGE_STEP_PX])
     if range_px is None:
         return wanted_px
@@ -105,7 +105,7 @@ def follow_range(
 def compose(
     pair: StereoPair, disparity_px: Float[np.ndarray, "h w"], range_px: tuple[float, float], status: str
 ) -> Frame:
-    """Draw the left image, its disparity beside it, and a line of text above both."""
+    """Draw the left image with its disparity beside it and a line of text above both."""
     colours = colour_disparity(disparity_px, range_px)
     if pair.left_seen is not None:
         colours[~pair.left_seen] = 0
@@ -118,7 +118,7 @@ def compose(
 
 
 def describe_range(camera: StereoCamera | None, range_px: tuple[float, float]) -> str:
-    """Describe the first and the last colour, in metres if the camera is known, else in pixels."""
+    """Return a legend for the first and last colours, in metres if the camera is known, else in pixels."""
     if camera is None:
         return "disparity {:.1f} px (blue) to {:.1f} px (red)".format(*range_px)
     far_m, near_m = camera.depth_m(np.array([range_px]))[0]
@@ -130,7 +130,7 @@ def _split_pair(pictures: Sequence[Picture], format: str | None) -> StereoPair:
         left, right = pictures
     else:
         [both] = pictures
-        PAIR_LAYOUTS[format].eye_size_px(both.shape[1], both.shape[0])  # raises if it cannot be halved
+        PAIR_LAYOUTS[format].eye_size_px(both.shape[1], both.shape[0])  # raises if the image cannot be halved
         left, right = PAIR_LAYOUTS[format].eyes(both)
     return StereoPair(left=left, right=right)
 

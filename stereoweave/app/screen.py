@@ -1,7 +1,7 @@
-"""A local web page that shows the newest image as a stream of JPEG.
+"""Local web page that shows the newest image as a stream of JPEG images.
 
 The headless build of OpenCV has no windows, and a rig often has no screen. Browsers show a stream of JPEG
-images (multipart/x-mixed-replace) without a script, on another machine through a tunnel.
+images (multipart/x-mixed-replace) without a script, and on another machine through a tunnel.
 """
 
 import threading
@@ -29,17 +29,17 @@ _PAGE = b"""<!doctype html>
   body { margin: 0; background: #111 }
   img { display: block; width: 100vw; height: 100vh; object-fit: contain }
 </style>
-<img src="/stream" alt="The left picture, and its disparity in colours beside it">
+<img src="/stream" alt="The left image with its disparity in colour beside it">
 </html>
 """
 _JPEG_QUALITY = 85
 
 
 class Screen(ThreadingHTTPServer):
-    """A web page on loopback that shows the newest image to every visitor.
+    """Server on the loopback interface that shows the newest image to every visitor.
 
     Args:
-        port: The port; 0 for any free one.
+        port: Port number; 0 for any free port.
 
     Raises:
         StereoweaveError: If the port is in use.
@@ -68,13 +68,13 @@ class Screen(ThreadingHTTPServer):
         self.server_close()
 
     def close(self) -> None:
-        """End the streams after the newest image."""
+        """End all streams after the newest image."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
 
     def show(self, picture: Picture) -> None:
-        """Show an RGB image from now on."""
+        """Replace the shown image with a new RGB image."""
         _, jpeg = cv2.imencode(
             ".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
         )
@@ -83,7 +83,7 @@ class Screen(ThreadingHTTPServer):
             self._changed.notify_all()
 
     def pictures(self) -> Iterator[bytes]:
-        """Yield the images as JPEG, from the current one on; images that come too fast are skipped."""
+        """Yield images as JPEG, from the current one on; skip those that arrive too fast."""
         shown = 0
         while True:
             with self._changed:
@@ -97,7 +97,7 @@ class Screen(ThreadingHTTPServer):
 class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         if urlsplit(f"//{self.headers.get('Host', '')}").hostname not in _HOST_NAMES:
-            self.send_error(403, "only for this machine")
+            self.send_error(403, "available on this machine only")
         elif self.path == "/":
             self._send_headers("text/html; charset=utf-8")
             self.wfile.write(_PAGE)
@@ -108,7 +108,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_error(404)
 
     def log_message(self, format: str, *values: object) -> None:
-        """Log nothing: each request would print a line on the terminal."""
+        """Log nothing, because each request would print a line on the terminal."""
 
     def _send_headers(self, kind: str) -> None:
         self.send_response(200)
@@ -123,5 +123,5 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(boundary)
         for jpeg in cast(Screen, self.server).pictures():
             header = f"Content-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n".encode()
-            # Send the boundary at once: a browser shows an image when it reaches its end.
+            # Send the boundary at once: a browser shows an image only after its final boundary.
             self.wfile.write(header + jpeg + boundary)

@@ -28,7 +28,7 @@ _STEP = 20
 
 
 def write_video(path: Path, frames: Sequence[np.ndarray], rate: float = 25) -> str:
-    """A video of these RGB pictures; motion JPEG, of which each frame stands for itself."""
+    """Write a motion JPEG video of these RGB images, in which every frame is a key frame."""
     size_px = frames[0].shape[1], frames[0].shape[0]
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), rate, size_px)
     assert writer.isOpened()
@@ -39,7 +39,7 @@ def write_video(path: Path, frames: Sequence[np.ndarray], rate: float = 25) -> s
 
 
 def greys(count: int) -> list[np.ndarray]:
-    """Pictures that tell their number: each is 20 levels brighter than the one before."""
+    """Return images that encode their number: each is 20 levels brighter than the previous one."""
     return [np.full((64, 96, 3), _STEP * number, np.uint8) for number in range(count)]
 
 
@@ -48,14 +48,14 @@ def number_of(picture: np.ndarray) -> int:
 
 
 def example_frame() -> np.ndarray:
-    """The example pair in one frame, at a quarter of its size."""
+    """Return the example pair side by side in one frame, at a quarter of its size."""
     left, right = (cv2.imread(str(TEXTURED / name)) for name in ("left.png", "right.png"))
     both = cv2.resize(np.hstack([left, right]), (320, 120), interpolation=cv2.INTER_AREA)
     return cv2.cvtColor(both, cv2.COLOR_BGR2RGB)
 
 
 def read_pictures(response: http.client.HTTPResponse) -> Iterator[np.ndarray]:
-    """The pictures of a stream in RGB, read as the format says: boundary, header, as many bytes."""
+    """Yield the RGB images of a stream: each has a boundary, a header, and as many bytes as it announces."""
     boundary = response.headers.get_boundary()
     assert response.headers.get_content_type() == "multipart/x-mixed-replace"
     while line := response.readline():
@@ -78,14 +78,14 @@ def request(url: str, path: str = "/", **headers: str) -> http.client.HTTPRespon
 
 
 def read_page_url(process: subprocess.Popen[str]) -> str:
-    """The address of the page, which the command says first."""
+    """Return the address of the page, which the command prints first."""
     assert process.stdout is not None
     found = re.search(r"http://127\.0\.0\.1:\d+/", process.stdout.readline())
     assert found is not None
     return found[0]
 
 
-def test_a_video_gives_its_frames_in_order_up_to_the_last_one_and_ends(tmp_path):
+def test_a_video_yields_its_frames_in_order_and_ends_after_the_last_one(tmp_path):
     last = -1
     with Capture([write_video(tmp_path / "video.avi", greys(8))]) as capture:
         while moment := capture.newest(last):
@@ -95,7 +95,7 @@ def test_a_video_gives_its_frames_in_order_up_to_the_last_one_and_ends(tmp_path)
     assert last == 7
 
 
-def test_who_comes_late_gets_the_newest_frame_and_not_those_before_it(tmp_path):
+def test_a_late_caller_gets_only_the_newest_frame(tmp_path):
     with Capture([write_video(tmp_path / "video.avi", greys(8), rate=50)]) as capture:
         assert capture.newest(6) is not None  # waits for the last one
         late = capture.newest(-1)
@@ -131,13 +131,13 @@ def test_a_series_of_pictures_is_a_video(tmp_path):
     ("source", "found"),
     [
         ("nowhere.mp4", "no such file"),
-        (str(TEXTURED / "calib.txt"), "something else"),
-        ("999", "no camera of that number"),
+        (str(TEXTURED / "calib.txt"), "a file that OpenCV cannot open"),
+        ("999", "no free camera with that number"),
         ("http://127.0.0.1:1/stream", "no stream at that address"),
     ],
 )
-def test_a_source_that_is_none_is_named_with_what_was_expected(source, found):
-    with pytest.raises(FormatError, match=rf"^{re.escape(source)}: expected a camera's number.*{found}"):
+def test_an_invalid_source_is_named_with_what_was_expected(source, found):
+    with pytest.raises(FormatError, match=rf"^{re.escape(source)}: expected the number of a camera.*{found}"):
         Capture([source])
 
 
@@ -156,11 +156,11 @@ def test_a_picture_and_a_stream_in_a_file_are_videos_that_end(tmp_path):
             assert capture.newest(last) is None
 
 
-def test_a_stream_that_stops_is_told_and_is_no_end_of_a_video():
+def test_a_stream_that_stops_is_an_error_and_not_the_end_of_a_video():
     grey = greys(6)[5]
     with Screen(0) as screen:
         screen.show(grey)
-        # It asks for some pictures before it knows what they are.
+        # OpenCV reads several images before it recognises the format of the stream.
         ended = threading.Event()
         shown = threading.Thread(target=keep_showing, args=(screen, grey, ended))
         shown.start()
@@ -171,7 +171,7 @@ def test_a_stream_that_stops_is_told_and_is_no_end_of_a_video():
             ended.set()
             shown.join()
             screen.close()
-            with pytest.raises(StereoweaveError, match=r"/stream: expected frames, found the end.*connected"):
+            with pytest.raises(StereoweaveError, match=r"/stream: expected frames, found the end.*check"):
                 capture.newest(10**6)
 
 
@@ -180,7 +180,7 @@ def keep_showing(screen: Screen, picture: np.ndarray, ended: threading.Event) ->
         screen.show(picture)
 
 
-def test_the_page_has_the_stream_and_the_stream_the_newest_pictures():
+def test_the_page_shows_a_stream_of_the_newest_images():
     first, second = greys(8)[3], greys(8)[7]
     with Screen(0) as screen:
         page = request(screen.url)
@@ -196,7 +196,7 @@ def test_the_page_has_the_stream_and_the_stream_the_newest_pictures():
         assert list(stream) == []
 
 
-def test_the_page_is_for_this_machine_alone():
+def test_the_page_is_available_on_this_machine_only():
     with Screen(0) as screen:
         assert request(screen.url, Host="somewhere.example:80").status == 403
         assert request(screen.url, Host=f"localhost:{screen.server_port}").status == 200
@@ -205,7 +205,7 @@ def test_the_page_is_for_this_machine_alone():
         assert request(screen.url).headers["Cross-Origin-Resource-Policy"] == "same-origin"
 
 
-def test_a_port_that_is_taken_is_named():
+def test_a_port_in_use_is_named():
     with (
         Screen(0) as screen,
         pytest.raises(StereoweaveError, match=f"^port: .* found {screen.server_port}"),
@@ -213,13 +213,13 @@ def test_a_port_that_is_taken_is_named():
         Screen(screen.server_port)
 
 
-def test_the_colours_follow_a_new_range_by_a_tenth():
+def test_the_colour_range_moves_a_tenth_of_the_way_to_a_new_one():
     near_px = np.full((40, 40), 50, np.float32)
-    assert follow_range(None, near_px) == (50, 51)  # at least a pixel
+    assert follow_range(None, near_px) == (50, 51)  # at least one pixel wide
     assert follow_range((0.0, 20.0), near_px) == pytest.approx((5, 23.1))
 
 
-def test_the_disparity_is_beside_the_left_picture_and_black_where_nothing_is_seen(rng):
+def test_the_disparity_is_beside_the_left_image_and_black_where_nothing_is_seen(rng):
     left = rng.integers(0, 256, (40, 60, 3), dtype=np.uint8)
     seen = np.ones((40, 60), bool)
     seen[:, :7] = False
@@ -233,28 +233,28 @@ def test_the_disparity_is_beside_the_left_picture_and_black_where_nothing_is_see
     assert (below[:, 60:67] == 0).all()
 
 
-def test_with_a_camera_the_colours_stand_for_metres():
+def test_with_a_known_camera_the_colours_are_labelled_in_metres():
     camera = StereoCamera(focal_px=600, baseline_m=0.1, cx_px=320, cy_px=240)
     assert describe_range(camera, (6.0, 40.0)) == "depth 10.00 m (blue) to 1.50 m (red)"
     assert describe_range(None, (6.0, 40.0)) == "disparity 6.0 px (blue) to 40.0 px (red)"
 
 
-def test_a_tally_counts_frames_their_rate_and_how_long_they_took(tmp_path):
+def test_a_tally_reports_frames_their_rate_and_their_delay(tmp_path):
     with Capture([write_video(tmp_path / "video.avi", greys(1))]) as capture:
         moment = capture.newest(-1)
     assert moment is not None
     tally = LiveTally()
-    assert tally.describe() == "nothing was shown"
+    assert tally.describe() == "no frame was shown"
     for number, (taken_s, now_s) in enumerate([(0.0, 0.5), (0.75, 1.0), (2.25, 2.5)]):
         tally.add(moment._replace(number=2 * number, taken_s=taken_s), now_s)
     assert tally.rate == 1.0
-    assert tally.describe() == "3 frames shown of 5, 1.0 a second, 333 ms after they came"
+    assert tally.describe() == "3 of 5 frames shown, 1.0 per second, 333 ms after capture"
 
 
-def test_what_is_shown_of_two_videos_is_their_left_picture_and_its_disparity(tmp_path):
+def test_two_videos_are_shown_as_the_left_image_and_its_disparity(tmp_path):
     left, right = np.split(cv2.resize(example_frame(), (640, 240)), 2, axis=1)
     sources = [write_video(tmp_path / "left.avi", [left]), write_video(tmp_path / "right.avi", [right])]
-    # calib.txt, for pictures of half its size.
+    # The calibration of the examples, scaled to half size.
     calibration = "cam0=[300 0 159.5; 0 300 119.5; 0 0 1]\ncam1=[300 0 159.5; 0 300 119.5; 0 0 1]\n"
     (tmp_path / "calib.txt").write_text(f"{calibration}doffs=0\nbaseline=100\nwidth=320\nheight=240\n")
     tally = LiveTally()
@@ -264,13 +264,13 @@ def test_what_is_shown_of_two_videos_is_their_left_picture_and_its_disparity(tmp
     assert (tally.shown, tally.last) == (1, 0)
     assert picture.shape == (240 + 32, 640, 3)
     assert np.abs(picture[32:, :320].astype(int) - left).mean() < 8
-    # The example's top is far, and blue; its bottom near, and red.
+    # The top of the example is far and therefore blue; its bottom is near and therefore red.
     top, bottom = picture[42:72, 340:620].mean((0, 1)), picture[242:, 340:620].mean((0, 1))
     assert top[2] > top[0]
     assert bottom[0] > bottom[2]
 
 
-def test_the_command_shows_a_video_and_sums_it_up_at_its_end(tmp_path):
+def test_the_command_shows_a_video_and_prints_statistics_at_its_end(tmp_path):
     video = write_video(tmp_path / "video.avi", 30 * [example_frame()], rate=10)
     with subprocess.Popen(
         [*COMMAND, video, "--port", "0", "--no-browser"], stdout=subprocess.PIPE, text=True
@@ -281,20 +281,20 @@ def test_the_command_shows_a_video_and_sums_it_up_at_its_end(tmp_path):
         rest, _ = process.communicate(timeout=60)
     assert process.returncode == 0
     counted = re.fullmatch(
-        rf"{re.escape(video)}: (\d+) frames shown of 30, [\d.]+ a second, \d+ ms .*\n", rest
+        rf"{re.escape(video)}: (\d+) of 30 frames shown, [\d.]+ per second, \d+ ms .*\n", rest
     )
     assert counted is not None
     assert 2 <= int(counted[1]) <= 30
 
 
-def test_an_interrupt_ends_the_command_in_order(tmp_path):
+def test_an_interrupt_ends_the_command_cleanly(tmp_path):
     video = write_video(tmp_path / "video.avi", 20 * [example_frame()], rate=0.2)
     process = subprocess.Popen(
         [*COMMAND, video, "--port", "0", "--no-browser"],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        # A shell that starts the tests in the background has interrupts ignored.
+        # If a shell starts the tests in the background, interrupts are ignored by default.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )
     with process:
@@ -302,10 +302,10 @@ def test_an_interrupt_ends_the_command_in_order(tmp_path):
         process.send_signal(signal.SIGINT)
         said, complaint = process.communicate(timeout=60)
     assert (process.returncode, complaint) == (0, "")
-    assert "1 frames shown of 1" in said
+    assert "1 of 1 frames shown" in said
 
 
-def test_a_frame_packing_that_is_none_is_refused_before_anything_is_opened():
+def test_an_unknown_frame_packing_is_refused_before_anything_is_opened():
     with pytest.raises(StereoweaveError, match=r"side_by_side, .* found beside of nowhere.mp4"):
         live(["nowhere.mp4"], format="beside")
     with pytest.raises(StereoweaveError, match=r"of one source .* found crossed of 0 1"):
