@@ -1,4 +1,4 @@
-"""The command `python -m fuzz`."""
+"""Command-line interface of the fuzzer: `python -m fuzz`."""
 
 import csv
 import os
@@ -28,10 +28,10 @@ def main(
     target: Annotated[
         list[str] | None, typer.Option(help=f"One of {', '.join(NAMES)}; default: all.")
     ] = None,
-    corpus: Annotated[Path, typer.Option(help="Folder for findings; each target has a subfolder.")] = CORPUS,
-    out: Annotated[Path | None, typer.Option(help="CSV file to which a row per target is added.")] = None,
+    corpus: Annotated[Path, typer.Option(help="Folder for findings, with a subfolder per target.")] = CORPUS,
+    out: Annotated[Path | None, typer.Option(help="CSV file to which one row per target is added.")] = None,
 ) -> None:
-    """Read damaged files of every kind; exit with 1 if there are findings."""
+    """Read damaged files of every kind; exit with status 1 if there are findings."""
     seed = SystemRandom().randrange(10**6) if seed is None else seed
     targets, jobs = target or list(NAMES), usable_cores()
     typer.echo(f"seed {seed}")
@@ -51,7 +51,7 @@ def _fuzz_target(target: str, seed: int, seconds: float, corpus: Path) -> Outcom
 
 
 def _lines(outcome: Outcome, corpus: Path) -> Iterator[str]:
-    """Yield a line for the target, then one per finding; store the findings."""
+    """Store the findings; yield a line for the target, then one for each finding."""
     per_s = outcome.cases / outcome.seconds
     yield f"{outcome.target:<13} {outcome.cases:>9,} cases, {per_s:7,.0f}/s, {len(outcome.findings)} findings"
     for finding in outcome.findings.values():

@@ -1,4 +1,4 @@
-"""Findings of the fuzzer: identified by their place, reduced to small files, and stored."""
+"""Findings of the fuzzer, which are identified by their place, reduced to small files, and stored."""
 
 import hashlib
 import re
@@ -8,18 +8,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
 
-# Excludes the thread that ends a worker together with its parent.
+# Excludes system/processes, whose thread ends a worker together with its parent.
 _OWN_FRAME = re.compile(r'/(stereoweave/(?!system/processes)[\w/]+\.py)", line \d+,? in (\w+)')
 
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """A case that caused anything but one of the package's own errors.
+    """Case that caused anything other than one of the package's own errors.
 
     Attributes:
-        what: Class of the exception, or the signal or other reason that ended the process.
-        place: Innermost function of the package on the stack.
-        detail: The exception's message, in one line.
+        what: Class of the exception, or what ended the process: the name of a signal, or "hang".
+        place: Innermost function of the package on the call stack.
+        detail: First line of the exception's message.
         name: Name of the file.
         content: Bytes of the file.
     """
@@ -32,31 +32,31 @@ class Finding:
 
     @property
     def key(self) -> str:
-        """Identity of the fault, the same for all its cases."""
+        """Identifier of the fault, the same for all cases of one fault."""
         return f"{self.what} in {self.place}"
 
     @classmethod
     def from_error(cls, error: BaseException, name: str, content: bytes) -> "Finding":
-        """Make a finding of an exception."""
+        """Return the finding for an exception."""
         frames = "".join(reversed(traceback.format_tb(error.__traceback__)))
         line = (str(error).strip().splitlines() or [""])[0][:200]
-        detail = line.encode("ascii", "backslashreplace").decode()  # the message may quote any bytes
+        detail = line.encode("ascii", "backslashreplace").decode()  # the message may quote arbitrary bytes
         return cls(what=type(error).__name__, place=_place(frames), detail=detail, name=name, content=content)
 
     @classmethod
     def from_death(cls, what: str, log: str, name: str, content: bytes) -> "Finding":
-        """Make a finding of the end of a process, from the output of `faulthandler`."""
+        """Return the finding for the death of a process, from the output of `faulthandler`."""
         return cls(what=what, place=_place(log), detail="", name=name, content=content)
 
 
 def _place(frames: str) -> str:
-    """Find the first function of the package in printed frames, innermost first."""
+    """Return the first function of the package in a printed stack, which lists the innermost frame first."""
     found = _OWN_FRAME.search(frames)
     return f"{found[1]}:{found[2]}" if found else "its target"
 
 
 def shrink(content: bytes, fails_alike: Callable[[bytes], bool], seconds: float) -> bytes:
-    """Remove parts of the content, large ones first, as long as the rest fails alike."""
+    """Return the content without the parts, large ones first, whose removal leaves the failure unchanged."""
     end_s, step = monotonic() + seconds, len(content) // 2
     while step:
         start = 0
@@ -71,7 +71,7 @@ def shrink(content: bytes, fails_alike: Callable[[bytes], bool], seconds: float)
 
 
 def keep(finding: Finding, folder: Path) -> Path:
-    """Write a finding to the file HASH-NAME."""
+    """Write a finding to a file named HASH-NAME and return its path."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{hashlib.sha256(finding.content).hexdigest()[:8]}-{finding.name}"
     path.write_bytes(finding.content)
@@ -79,5 +79,5 @@ def keep(finding: Finding, folder: Path) -> Path:
 
 
 def list_findings(folder: Path) -> dict[Path, str]:
-    """Map the files of a folder's findings to the names that they had in their cases."""
+    """Return the finding files in a folder, each with the name that the file had in its case."""
     return {path: path.name.partition("-")[2] for path in sorted(folder.glob("*-*"))}

@@ -1,10 +1,10 @@
-"""Random damage to valid files: bytes, lengths, numbers in text, nesting, parts of other files."""
+"""Random damage to valid files: changed bytes, lengths and numbers, deep nesting, parts of other files."""
 
 import re
 from collections.abc import Callable, Sequence
 from random import Random
 
-# Larger cases would take the time of many small ones, and findings are committed to git.
+# A larger case would take as much time as many small ones, and findings are committed to git.
 MOST_BYTES = 200_000
 _MOST_CHANGES = 6
 _COUNTS = (*[1] * 10, 2, 2, 3, 20, 1000, 40_000)
@@ -23,8 +23,8 @@ def mutate(content: bytes, others: Sequence[bytes], tokens: Sequence[bytes], rng
 
     Args:
         content: Bytes of a file.
-        others: Further files of the same kind, whose parts may be spliced in.
-        tokens: Words with a meaning in such files.
+        others: Other files of the same kind, from which parts may be spliced in.
+        tokens: Words that have a meaning in such files.
         rng: Source of randomness.
     """
     changes: list[Callable[[bytes, Random], bytes]] = [
@@ -32,7 +32,7 @@ def mutate(content: bytes, others: Sequence[bytes], tokens: Sequence[bytes], rng
         lambda before, rng: _splice(before, rng.choice(others), rng),
         lambda before, rng: _insert(before, rng.choice(tokens or (b"\0",)), rng),
     ]
-    # Most cases differ little from a valid file, so that they get far into its reader.
+    # Most cases differ little from a valid file, so that the reader gets far into them.
     for _ in range(min(1 + int(rng.expovariate(0.7)), _MOST_CHANGES)):
         content = rng.choice(changes)(content, rng)[:MOST_BYTES]
     return content
@@ -51,7 +51,7 @@ def _fill(content: bytes, rng: Random) -> bytes:
 
 
 def _overwrite_length(content: bytes, rng: Random) -> bytes:
-    """Write a number to a place that may hold a length, an offset or a count."""
+    """Write a number to a random place, which may hold a length, an offset or a count."""
     width = rng.choice((1, 2, 4, 8))
     value = rng.choice((*_LENGTHS, len(content), rng.randrange(1 << 16))) % (1 << 8 * width)
     start = _place(content, rng)
@@ -74,7 +74,7 @@ def _repeat(content: bytes, rng: Random) -> bytes:
 
 
 def _swap(content: bytes, rng: Random) -> bytes:
-    """Swap two neighbouring parts."""
+    """Swap two adjacent parts."""
     start, middle, end = sorted(_place(content, rng) for _ in range(3))
     return content[:start] + content[middle:end] + content[start:middle] + content[end:]
 
@@ -88,7 +88,7 @@ def _change_number(content: bytes, rng: Random) -> bytes:
 
 
 def _splice(content: bytes, other: bytes, rng: Random) -> bytes:
-    """Join the beginning of one file with the end of another, or insert a part of the other."""
+    """Join the beginning of one file to the end of another, or replace a part with one of the other."""
     if rng.random() < 0.5:
         return content[: _place(content, rng)] + other[_place(other, rng) :]
     (start, end), (first, last) = _run(content, rng), _run(other, rng)
@@ -100,18 +100,18 @@ def _insert(content: bytes, token: bytes, rng: Random) -> bytes:
 
 
 def _with_many(content: bytes, place: int, part: bytes, rng: Random) -> bytes:
-    """Insert a part, sometimes so often that a recursive parser nests deeply."""
+    """Insert a part one or more times, sometimes often enough to make a recursive parser nest deeply."""
     count = min(rng.choice(_COUNTS), MOST_BYTES // max(len(part), 1))
     return content[:place] + part * count + content[place:]
 
 
 def _place(content: bytes | bytearray, rng: Random) -> int:
-    """Draw a place in the content, half the time in its header, which describes the rest."""
+    """Draw a random place in the content. Half of all draws are in the header, which describes the rest."""
     most = max(len(content), 1)
     return rng.randrange(min(most, 64) if rng.random() < 0.5 else most)
 
 
 def _run(content: bytes, rng: Random) -> tuple[int, int]:
-    """Draw start and end of a part; short and long parts are equally likely."""
+    """Draw the start and end of a random part; short and long parts are equally likely."""
     start = _place(content, rng)
     return start, min(start + (1 << rng.randrange(max(len(content), 2).bit_length())), len(content))

@@ -1,4 +1,4 @@
-"""Repair of checksums in damaged files; otherwise the first check would reject most of them."""
+"""Repair of checksums in damaged files, most of which the first check would otherwise reject."""
 
 import io
 import struct
@@ -12,7 +12,7 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def repair_png(content: bytes) -> bytes:
-    """Correct the checksum of each chunk if the file is a PNG."""
+    """Correct the checksum of every chunk of a PNG file; return any other file unchanged."""
     if not content.startswith(_PNG):
         return content
     repaired, place = bytearray(content), len(_PNG)
@@ -27,7 +27,7 @@ def repair_png(content: bytes) -> bytes:
 
 
 def repair_shard(content: bytes) -> bytes:
-    """Correct the checksums of a shard's member headers and of its pairs' files."""
+    """Correct the checksums of a shard: those of its member headers and of the files of its pairs."""
     files = _files_in(_with_right_heads(content))
     stream = io.BytesIO()
     with tarfile.open(fileobj=stream, mode="w", encoding="latin-1") as tar:
@@ -42,22 +42,22 @@ def repair_shard(content: bytes) -> bytes:
 
 
 def _files_in(content: bytes) -> dict[str, bytes]:
-    """Read the files of a tar file, up to the first unreadable one."""
+    """Read the members of a tar file by name, up to the first unreadable one."""
     files: dict[str, bytes] = {}
     with (
         suppress(tarfile.TarError, ValueError, OverflowError),
         tarfile.open(fileobj=io.BytesIO(content), mode="r:", encoding="latin-1") as tar,
     ):
         for member in tar:
-            if member.size < 0:  # the same header would be read again forever
+            if member.size < 0:  # otherwise, the same header would be read again forever
                 break
-            if member.name.isprintable():  # lone surrogates cannot be written again
+            if member.name.isprintable():  # a lone surrogate cannot be written again
                 files[member.name] = content[member.offset_data :][: member.size]
     return files
 
 
 def _with_right_heads(content: bytes) -> bytes:
-    """Correct the checksum in every block of a tar file that looks like a member's header."""
+    """Correct the checksum of every block of a tar file that looks like a member header."""
     repaired = bytearray(content)
     for start in range(0, len(content) - 511, 512):
         head = repaired[start : start + 512]

@@ -1,4 +1,4 @@
-"""HTTP requests in files, passed to an ASGI application as a server would pass them."""
+"""HTTP requests read from files and passed to an ASGI application as a server would do."""
 
 import asyncio
 from collections.abc import Awaitable, Callable, MutableMapping
@@ -15,11 +15,11 @@ Application = Callable[
 
 
 class ServerError(Exception):
-    """A response that reports an internal error of the server, or a missing response."""
+    """Response that reports an internal server error, or missing response."""
 
 
 def request_bytes(method: str, path: str, **form: Any) -> bytes:
-    """Serialise a request to the bytes sent over the network; `form` is passed to httpx."""
+    """Return a request as the bytes sent over the network; `form` is passed to httpx."""
     request = httpx.Request(method, f"http://127.0.0.1{path}", **form)
     body = request.read()
     headers = [name + b": " + value for name, value in request.headers.raw]
@@ -28,14 +28,14 @@ def request_bytes(method: str, path: str, **form: Any) -> bytes:
 
 
 def repair_length(content: bytes) -> bytes:
-    """Set the Content-Length of a request to its body's length."""
+    """Set the Content-Length of a request to the length of its body."""
     head, blank, body = content.partition(b"\r\n\r\n")
     lines = [line for line in head.split(b"\r\n") if not line.lower().startswith(b"content-length")]
     return b"\r\n".join([*lines, b"Content-Length: %d" % len(body)]) + blank + body
 
 
 def send(application: Application, content: bytes) -> int | None:
-    """Return the status of the response, or None if the content is not an HTTP request.
+    """Send a request. Return the status of the response, or None if the content is not an HTTP request.
 
     Raises:
         ServerError: The status is 500.
@@ -48,10 +48,10 @@ def send(application: Application, content: bytes) -> int | None:
 
 
 def _parse(content: bytes) -> list[Any]:
-    """Parse a request to h11's events: the head, parts of the body, and its end if it is complete."""
+    """Parse a request into h11 events: the head, parts of the body, and the end if the body is complete."""
     connection, events = h11.Connection(h11.SERVER), []
     try:
-        connection.receive_data(content or b"\r\n")  # empty data would close the connection
+        connection.receive_data(content or b"\r\n")  # empty data would mean a closed connection
         while (event := connection.next_event()) not in (h11.NEED_DATA, h11.PAUSED):
             events.append(event)
     except h11.RemoteProtocolError:

@@ -1,4 +1,4 @@
-"""Fuzzing of one target by worker processes, which are replaced when they die."""
+"""Fuzzing of one target in worker processes, each of which is replaced if it dies."""
 
 import multiprocessing
 import signal
@@ -19,8 +19,8 @@ class Outcome:
     Attributes:
         target: Name of the target.
         cases: Number of files read.
-        seconds: Time spent, without the start of processes.
-        findings: Findings by their keys.
+        seconds: Time spent, excluding the start of processes.
+        findings: Findings by key.
     """
 
     target: str
@@ -29,12 +29,12 @@ class Outcome:
     findings: dict[str, Finding] = field(default_factory=dict)
 
     def add(self, finding: Finding) -> None:
-        """Add a finding unless its fault is known."""
+        """Add a finding unless one with the same key is known."""
         self.findings.setdefault(finding.key, finding)
 
 
 def fuzz(target: str, seed: int, seconds: float, corpus: Path, case_s: float = 10.0) -> Outcome:
-    """Read damaged files of a target for a number of seconds.
+    """Read damaged files of a target for a number of seconds and return the outcome.
 
     Raises:
         RuntimeError: The fuzzer itself failed; the message contains its log.
@@ -50,8 +50,8 @@ def fuzz(target: str, seed: int, seconds: float, corpus: Path, case_s: float = 1
 
 
 def _run(task: Task, outcome: Outcome) -> None:
-    """Run one worker until it is done or dies, and add its cases and findings to the outcome."""
-    context = multiprocessing.get_context("spawn")  # a fork would share this process's threads
+    """Run one worker until it finishes or dies, and add its cases and findings to the outcome."""
+    context = multiprocessing.get_context("spawn")  # a fork would inherit locks held by threads
     messages, sender = context.Pipe(duplex=False)
     worker = context.Process(
         target=work, args=(task, outcome.cases, list(outcome.findings), sender), daemon=True
@@ -70,7 +70,7 @@ def _run(task: Task, outcome: Outcome) -> None:
 
 
 def _listen(messages: Connection, outcome: Outcome) -> bool:
-    """Add a worker's messages to the outcome. Return whether it finished before it ended."""
+    """Add the messages of a worker to the outcome. Return whether the worker finished its task."""
     start_s = monotonic()
     try:
         while (message := messages.recv()) != DONE:
@@ -79,7 +79,7 @@ def _listen(messages: Connection, outcome: Outcome) -> bool:
                     outcome.add(message)
                 case int():
                     outcome.cases += 1
-                case _:  # READY: the time to load does not count
+                case _:  # READY: loading time does not count
                     start_s = monotonic()
     except EOFError:
         return False
@@ -89,7 +89,7 @@ def _listen(messages: Connection, outcome: Outcome) -> bool:
 
 
 def _make_finding_of_death(code: int, log: str, folder: Path) -> Finding:
-    """Make a finding of a worker's end, by a signal or by its own time limit for a case."""
+    """Return the finding for a worker that was killed by a signal or by its own time limit for a case."""
     what = signal.Signals(-code).name if code < 0 else "hang"
     (case,) = folder.iterdir()
     return Finding.from_death(what, log, case.name, case.read_bytes())

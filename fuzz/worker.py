@@ -1,4 +1,4 @@
-"""Worker process that reads damaged files of one target until its time is up or it dies."""
+"""Worker process that reads damaged files of one target until its time is up or the process dies."""
 
 import faulthandler
 import os
@@ -30,11 +30,11 @@ class Task:
     """Task of a worker.
 
     Attributes:
-        target: Name of the target, for `targets.load`.
+        target: Name of the target, as for `targets.load`.
         seed: Random seed.
-        seconds: Working time, from the first case on.
-        case_s: Time limit of a case.
-        corpus: Folder of the target's earlier findings.
+        seconds: Working time, measured from the first case.
+        case_s: Time limit for a case, in seconds.
+        corpus: Folder of earlier findings for the target.
         folder: The worker's own folder, for the current file and the log of a crash.
     """
 
@@ -47,9 +47,9 @@ class Task:
 
 
 def work(task: Task, first: int, known: Sequence[str], messages: Connection) -> None:
-    """Read cases from number `first` on.
+    """Read cases from number `first` on and report to `messages`.
 
-    Sends READY, the number of each case before it is read, each Finding with a new key, and DONE.
+    The messages are READY, the number of each case before it is read, each Finding with a new key, and DONE.
     """
     begin_work(threads=1)
     with (task.folder / LOG).open("ab") as log, Path(os.devnull).open("wb") as nowhere:
@@ -78,7 +78,7 @@ def work(task: Task, first: int, known: Sequence[str], messages: Connection) -> 
 
 
 class Cases:
-    """Cases of a task by number: the valid files, the earlier findings, then damaged files."""
+    """Numbered cases of a task: the valid files, the earlier findings, then damaged files."""
 
     def __init__(self, task: Task) -> None:
         self._task, self._target = task, load(task.target)
@@ -93,7 +93,7 @@ class Cases:
             self.find_fault(name, content)
 
     def make(self, number: int) -> tuple[str, bytes]:
-        """Make the name and bytes of a case; they depend only on its number, the seed and the corpus."""
+        """Return the name and bytes of a case, which depend only on its number, the seed and the corpus."""
         if number < len(self._starts):
             return self._starts[number]
         rng = Random(f"{self._task.seed} {self._task.target} {number}")
@@ -102,7 +102,7 @@ class Cases:
         return name, self._target.repair(content) if rng.random() < 0.5 else content
 
     def find_fault(self, name: str, content: bytes) -> Finding | None:
-        """Read a file. Return the finding, or None if it is read or refused as it should be."""
+        """Read a file. Return the finding, or None if the file is read or properly refused."""
         path = self._task.folder / CASE / name
         path.parent.mkdir(exist_ok=True)
         for other in path.parent.iterdir():
@@ -118,7 +118,7 @@ class Cases:
         return None
 
     def shrink(self, finding: Finding) -> Finding:
-        """Reduce the finding's content as far as possible in two seconds."""
+        """Return the finding with its content reduced as far as possible within two seconds."""
 
         def fails_alike(content: bytes) -> bool:
             fault = self.find_fault(finding.name, content)
@@ -128,7 +128,7 @@ class Cases:
 
 
 def _limit_memory() -> None:
-    """Limit this process to 2 GB more than it has now, and write no core dump."""
+    """Limit the memory of this process to 2 GB more than it uses now, and disable core dumps."""
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     most = pages * resource.getpagesize() + _MORE_BYTES

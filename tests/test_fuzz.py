@@ -1,4 +1,4 @@
-"""The fuzzer finds what is planted, its valid files are valid, and what it found once stays mended."""
+"""The fuzzer finds planted faults, its start files are valid, and earlier findings stay fixed."""
 
 import asyncio
 import csv
@@ -27,10 +27,10 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 CORPUS = REPOSITORY / "tests" / "corpus"
 FOUND = [path for name in NAMES for path in list_findings(CORPUS / name)]
 
-# Of Ray's own code, as it is imported.
+# Ray's own code warns on import.
 pytestmark = pytest.mark.filterwarnings("ignore:Using extra keyword arguments on `Field`:DeprecationWarning")
 
-# What each word of `broken_target` is found as.
+# The finding that each word of `broken_target` causes.
 PLANTED = {
     "raise": "IndexError in its target",
     "warn": "UserWarning in its target",
@@ -42,7 +42,7 @@ PLANTED = {
 
 @pytest.fixture
 def planted(tmp_path) -> Path:
-    """A corpus with a file for each word."""
+    """Return a corpus with one file for each word."""
     folder = tmp_path / "corpus" / "broken_target"
     folder.mkdir(parents=True)
     for word in [*PLANTED, "refuse"]:
@@ -50,17 +50,17 @@ def planted(tmp_path) -> Path:
     return folder
 
 
-def test_errors_warnings_crashes_hangs_and_hunger_are_found_and_refusals_are_not(planted):
+def test_errors_warnings_crashes_hangs_and_memory_exhaustion_are_found_and_refusals_are_not(planted):
     outcome = fuzz("broken_target", seed=1, seconds=1.5, corpus=planted, case_s=0.3)
     assert set(outcome.findings) == set(PLANTED.values())
     assert outcome.cases >= 1 + len(PLANTED)
     contents = {key: finding.content for key, finding in outcome.findings.items()}
-    assert contents["IndexError in its target"] == b"raise"  # made as small as it can be
+    assert contents["IndexError in its target"] == b"raise"  # reduced as far as possible
     assert b"crash" in contents["SIGSEGV in its target"]
     assert b"hang" in contents["hang in its target"]
 
 
-def test_the_command_keeps_what_it_found_and_fails(tmp_path):
+def test_the_command_stores_its_findings_and_fails(tmp_path):
     def run(target: str) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-m", "fuzz", "--seconds", "0.5", "--seed", "3", "--target", target]
         command += ["--corpus", str(tmp_path / "corpus"), "--out", str(tmp_path / "fuzz.csv")]
@@ -71,7 +71,7 @@ def test_the_command_keeps_what_it_found_and_fails(tmp_path):
     done = run("broken_target")
     assert done.returncode == 1, done.stderr
     (path,) = (tmp_path / "corpus" / "broken_target").iterdir()
-    assert path.read_bytes() == b"raise"  # a word that it knows
+    assert path.read_bytes() == b"raise"  # a token of the target
     assert f"IndexError in its target: out of range  -> {path}" in done.stdout
     done = run("maps")
     assert done.returncode == 0, done.stdout
@@ -93,7 +93,7 @@ def test_every_start_file_is_valid(tmp_path, monkeypatch, without_shape_checks, 
         path.unlink()
 
 
-def test_a_case_depends_on_its_seed_alone_and_is_never_long():
+def test_a_case_depends_only_on_its_seed_and_has_a_limited_length():
     start, others, tokens = b"width = 3\n" * 20, [b"other\n" * 9], [b"token"]
     cases = [mutate(start, others, tokens, Random(number)) for number in range(2000)]
     assert cases == [mutate(start, others, tokens, Random(number)) for number in range(2000)]
@@ -105,11 +105,11 @@ def test_a_case_depends_on_its_seed_alone_and_is_never_long():
 
 def test_a_repaired_png_and_a_repaired_shard_pass_their_checks(tmp_path, without_shape_checks):
     png = load("pictures").starts()["colour.png"]
-    damaged = png.replace(b"IHDR\0\0\0\x90", b"IHDR\0\0\0\x40")  # 64 columns, no longer 144
+    damaged = png.replace(b"IHDR\0\0\0\x90", b"IHDR\0\0\0\x40")  # 64 columns instead of 144
     assert damaged != png
     assert repair_png(png) == png
     assert repair_png(damaged)[:16] == damaged[:16]
-    assert repair_png(damaged)[29:33] != damaged[29:33]  # the checksum of the head
+    assert repair_png(damaged)[29:33] != damaged[29:33]  # checksum of the header
     shards = load("shards")
     ((name, shard),) = shards.starts().items()
     other = shard.replace(b'"focal_px": 60.0', b'"focal_px": 70.0')
@@ -119,7 +119,7 @@ def test_a_repaired_png_and_a_repaired_shard_pass_their_checks(tmp_path, without
         shards.read(path)
     path.write_bytes(repair_shard(other))
     shards.read(path)
-    # The reader takes no compressed shard, whose head may ask for gigabytes; nor is one unpacked here.
+    # The reader refuses compressed shards, which may expand to gigabytes. The repair does not unpack them.
     assert repair_shard(lzma.compress(shard)) == repair_shard(b"")
 
 
@@ -183,8 +183,8 @@ def test_a_gate_that_lets_a_foreign_file_pass_is_a_finding():
 
 
 @pytest.mark.parametrize("path", FOUND, ids=lambda path: f"{path.parent.name}/{path.name}")
-def test_what_was_found_once_is_answered_by_an_own_error(tmp_path, without_shape_checks, path):
-    """`make fuzz` writes these files; the reader may also have learnt to read them."""
+def test_an_earlier_finding_is_now_read_or_refused(tmp_path, without_shape_checks, path):
+    """`make fuzz` wrote these files. By now, the reader may also accept them."""
     copy = tmp_path / path.name.partition("-")[2]
     shutil.copy(path, copy)
     target = load(path.parent.name)

@@ -1,4 +1,4 @@
-"""Fuzzing targets, one per module: generated valid files, and the function that reads them."""
+"""Fuzzing targets, one per module: generated valid files and a function that reads them."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -16,13 +16,14 @@ NAMES = (
 
 @dataclass(frozen=True, kw_only=True)
 class Target:
-    """An entrance for untrusted data.
+    """Entry point for untrusted data.
 
     Attributes:
-        starts: Makes valid files, by name.
-        read: Reads a file as the package does; it may raise StereoweaveError, any other error is a finding.
-        tokens: Words with a meaning in such files.
-        repair: Corrects checksums and the like, so that damage gets past them.
+        starts: Function that generates valid files, by name.
+        read: Function that reads a file as the package does. It may raise StereoweaveError; any other error
+            is a finding.
+        tokens: Words that have a meaning in such files.
+        repair: Function that corrects checksums and lengths, so that damage gets past such checks.
     """
 
     starts: Callable[[], Mapping[str, bytes]]
@@ -32,13 +33,13 @@ class Target:
 
 
 def load(name: str) -> Target:
-    """Load the target of a module of this package, or of any other module with a TARGET."""
+    """Return the target from a module of this package, or from any other module that defines TARGET."""
     target: Target = import_module(f"{__name__}.{name}" if name in NAMES else name).TARGET
     return target
 
 
 def read_every_way(*ways: Callable[[], object]) -> None:
-    """Read a file in several ways; raise the first StereoweaveError if all fail."""
+    """Read a file in several ways; raise the first StereoweaveError if every way fails."""
     errors = []
     for read in ways:
         try:
@@ -50,7 +51,7 @@ def read_every_way(*ways: Callable[[], object]) -> None:
 
 
 def write_to_bytes(name: str, write: Callable[[Path], object]) -> bytes:
-    """Return the bytes of a file of that name, written by `write`."""
+    """Return the bytes that `write` writes to a file of this name."""
     with TemporaryDirectory() as folder:
         path = Path(folder, name)
         write(path)

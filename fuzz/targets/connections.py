@@ -1,4 +1,4 @@
-"""Connections to the service's HTTP server, byte by byte, in front of a small application."""
+"""Raw connections to the service's HTTP server, which runs a small application."""
 
 import asyncio
 import logging
@@ -18,23 +18,23 @@ from stereoweave.errors import StereoweaveError
 from stereoweave.service.server import ClientTimeouts, run_http_server
 
 ANSWERED_S = 3.0
-# The client closes after this time without data, so that later requests on the connection are answered too.
-# Short, because a case may get no answer; on a busy machine a valid request needs longer.
+# The client stops sending after this time without data, so that later requests on the connection are answered
+# too. The time is short, because a case may get no answer. On a busy machine, a valid request needs longer.
 QUIET_S = 0.004
 _WORK_S = 0.001
-# Sent after each case: its response comes after the application's remaining work.
+# Sent after each case. Its response comes after the application has finished its remaining work.
 _PLAIN = b"GET /later HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n"
 _STATUS = re.compile(rb"HTTP/1\.1 (\d{3}) ")
-# Loggers to which uvicorn and asyncio report the exceptions that they catch.
+# Loggers that receive the exceptions that uvicorn and asyncio catch.
 _LOGGERS = [logging.getLogger(name) for name in ("uvicorn.error", "asyncio")]
 
 
 def talk(app: ASGIApp, content: bytes) -> list[int]:
-    """Send bytes over a connection and return the statuses of the responses.
+    """Send bytes over a connection and return the status of every response.
 
     Raises:
         ServerError: A status is 500, or the server does not answer a plain request afterwards.
-        BaseException: An error of the server or the application that was logged.
+        BaseException: An error that the server or the application logged.
     """
     address = _address(app)
     with _collect_errors() as errors:
@@ -48,7 +48,7 @@ def talk(app: ASGIApp, content: bytes) -> list[int]:
 
 
 def _statuses(address: tuple[str, int], content: bytes, quiet_s: float) -> list[int]:
-    """Return the statuses of all responses; close for sending after `quiet_s` without data."""
+    """Return the statuses of all responses; close the sending side after `quiet_s` without data."""
     received = bytearray()
     try:
         with socket.create_connection(address, timeout=ANSWERED_S) as connection:
@@ -73,7 +73,7 @@ def _receive(connection: socket.socket, received: bytearray) -> None:
 
 @contextmanager
 def _collect_errors() -> Iterator[list[BaseException]]:
-    """Collect the errors that are logged within the block, instead of printing them."""
+    """Collect the errors that are logged within the block instead of printing them."""
     errors: list[BaseException] = []
 
     def collect(record: logging.LogRecord) -> bool:
@@ -98,10 +98,10 @@ def _collect_errors() -> Iterator[list[BaseException]]:
 def _address(app: ASGIApp) -> tuple[str, int]:
     """Start a server that ends with this process, and return its address."""
     listener = socket.create_server(("127.0.0.1", 0))
-    # The server's own thread inherits `daemon`, so that it does not keep the process alive.
+    # The thread of the server inherits `daemon`, so it does not keep the process alive.
     threading.Thread(target=_serve, args=(app, listener), daemon=True).start()
     host, port = listener.getsockname()
-    # After this response, uvicorn has set the levels of its loggers.
+    # Once this response arrives, uvicorn has set the levels of its loggers.
     _statuses((host, port), _PLAIN, ANSWERED_S)
     return host, port
 
@@ -112,7 +112,7 @@ def _serve(app: ASGIApp, listener: socket.socket) -> None:
 
 
 async def answer_length(scope: Scope, receive: Receive, send: Send) -> None:
-    """Respond with the body's length; the path selects whether before reading it, later, or in parts."""
+    """Respond with the length of the body; the path selects an early, late or divided response."""
     if scope["type"] != "http":
         return
     path = scope["path"]

@@ -1,4 +1,4 @@
-"""Disparities, depths and masks: PFM, 16-bit PNG, TIFF."""
+"""Maps of disparity or depth, and masks, as PFM, 16-bit PNG and TIFF."""
 
 from functools import partial
 from pathlib import Path

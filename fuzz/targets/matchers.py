@@ -1,4 +1,4 @@
-"""Matcher files: ONNX graphs with metadata."""
+"""Matcher files, which are ONNX graphs with metadata."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ def _starts() -> dict[str, bytes]:
 
 
 def _matcher(*size: int | str) -> bytes:
-    """Make a matcher whose disparity is the left view's red channel."""
+    """Return a matcher file whose disparity is the red channel of the left image."""
     batch, height, width = size
     pictures = [
         helper.make_tensor_value_info(name, TensorProto.FLOAT, [batch, 3, height, width])

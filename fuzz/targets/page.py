@@ -22,15 +22,15 @@ _UPLOAD, _JOIN, _FILE = "/gradio_api/upload", "/gradio_api/queue/join", "/gradio
 
 
 class LeakError(Exception):
-    """A visitor got access to a file that the page had not named to them."""
+    """Error raised if a visitor can reach a file that the page has not named to them."""
 
 
 class _Page:
-    """Stand-in for Gradio: names files in its responses, and records those that requests name.
+    """Stand-in for Gradio that names files in its responses and records the files named in requests.
 
     Attributes:
-        named: Files that responses name.
-        asked: Files that requests have named.
+        named: Files to name in responses.
+        asked: Files named in requests so far.
     """
 
     def __init__(self) -> None:
@@ -54,17 +54,17 @@ class _Page:
         await JSONResponse(self.named)(scope, receive, send)
 
     def _keep(self, entries: list[tuple[str, Any]]) -> dict[str, Any]:
-        """Record all paths of a JSON object, even repeated keys."""
+        """Record all paths in a JSON object, including those under repeated keys."""
         self.asked += [value for key, value in entries if key == "path"]
         return dict(entries)
 
 
 def visit(content: bytes, gate: Callable[[ASGIApp], ASGIApp] = OwnFiles) -> int | None:
-    """Give a file each to two visitors, send a request, and return the response's status.
+    """Give one file to each of two visitors, send a request, and return the status of its response.
 
     Raises:
-        LeakError: The request reached the page with a file that its sender had not been given.
-        Exception: Any error of the gate.
+        LeakError: The gate let a request pass that names a file not given to its sender.
+        Exception: Any error raised by the gate.
     """
     page = _Page()
     server = ContentPolicy(gate(page))

@@ -1,4 +1,4 @@
-"""Lists of pairs for `depth --list`."""
+"""Lists of pairs, as read by `depth --list`."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Pictures of one view or two, in every supported format, with tags, profiles and markers."""
+"""Pictures with one or two views, in every supported format, with tags, profiles and markers."""
 
 import io
 from collections.abc import Iterator
@@ -20,7 +20,7 @@ _SIZE_PX = 48, 72
 
 
 def eyes(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Make a small pair, uint8 RGB [48, 72, 3]: one texture with a disparity of 4 px."""
+    """Return a small pair, uint8 RGB [48, 72, 3], of one texture with a disparity of 4 px."""
     rng = np.random.default_rng(seed)
     noise = rng.integers(0, 256, (_SIZE_PX[0], _SIZE_PX[1] + 4, 3), np.uint8)
     texture = cv2.GaussianBlur(noise, (0, 0), 1)
@@ -28,7 +28,7 @@ def eyes(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 
 
 def encode_picture(image: np.ndarray, kind: str, **options: Any) -> bytes:
-    """Encode a picture with Pillow."""
+    """Return an image encoded by Pillow."""
     stream = io.BytesIO()
     Image.fromarray(image).save(stream, kind, **options)
     return stream.getvalue()

@@ -1,4 +1,4 @@
-"""Requests to the service, in front of a real network."""
+"""Requests to the service, answered by a real network."""
 
 import asyncio
 import tempfile
@@ -15,7 +15,7 @@ from stereoweave.matching.matcher import Matcher
 from stereoweave.service.answers import ServiceAnswer, ServiceJob, answer_many, check_pixels
 from stereoweave.service.asgi import Guard, Limits, make_app
 
-# A first view compiles its kernels.
+# The first view compiles the kernels.
 _LIMITS = Limits(megapixels=0.05, megabytes=0.5, timeout_s=600)
 
 
