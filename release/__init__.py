@@ -1,1 +1,1 @@
-"""Check of a release: the contents of its files, and whether they install and run."""
+"""Release checks: contents of the release files, installation and a trial run."""

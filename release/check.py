@@ -1,7 +1,7 @@
 """Check a release: python -m release.check WHEEL SDIST.
 
-Compares the contents of both with the files that git tracks, then installs each in an empty environment of
-every Python on this machine, and runs it on the example pair.
+Compares the contents of both files with the files that git tracks. Then, for every supported Python on this
+machine, installs each file in an empty environment and runs it on the example pair.
 """
 
 import os
@@ -16,39 +16,39 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = "stereoweave"
-# The first, the oldest that pyproject.toml allows, is required; later ones are tried if they are installed.
+# The first version, the oldest that pyproject.toml allows, is required. Later ones are tried if installed.
 VERSIONS = ("3.11", "3.12", "3.13", "3.14")
 # Files that setuptools adds to a source distribution.
 _GENERATED = ("PKG-INFO", "setup.cfg", f"{PACKAGE}.egg-info/")
 
 
 def tracked_files(root: Path) -> set[str]:
-    """List the files that git tracks, relative to the root."""
+    """Return the files that git tracks, relative to the root."""
     listed = subprocess.run(["git", "ls-files", "-z"], cwd=root, capture_output=True, text=True, check=True)
     return set(filter(None, listed.stdout.split("\0")))
 
 
 def wheel_files(wheel: Path) -> set[str]:
-    """List the files that a wheel installs, without its metadata."""
+    """Return the files that a wheel installs, without its metadata."""
     with zipfile.ZipFile(wheel) as archive:
         return {name for name in archive.namelist() if ".dist-info/" not in name}
 
 
 def sdist_files(sdist: Path) -> set[str]:
-    """List the files of a source distribution, without those that setuptools adds."""
+    """Return the files of a source distribution, without those that setuptools adds."""
     with tarfile.open(sdist) as archive:
         names = {member.name.partition("/")[2] for member in archive if member.isfile()}
     return {name for name in names if not name.startswith(_GENERATED)}
 
 
 def differences(file: Path, expected: set[str], found: set[str]) -> list[str]:
-    """Make a line for each path that a release file lacks, or that git does not track."""
+    """Return a line for each path that the release file lacks or that git does not track."""
     missing = [f"{file.name}: {name} is missing" for name in sorted(expected - found)]
     return missing + [f"{file.name}: {name} is not tracked by git" for name in sorted(found - expected)]
 
 
 def content_differences(wheel: Path, sdist: Path) -> list[str]:
-    """Compare both files with the repository; one line per difference."""
+    """Return a line for each difference between the release files and the repository."""
     tracked = tracked_files(ROOT)
     package = {name for name in tracked if name.startswith(f"{PACKAGE}/")}
     return [
@@ -58,7 +58,10 @@ def content_differences(wheel: Path, sdist: Path) -> list[str]:
 
 
 def python_here(version: str) -> Path | None:
-    """Find the interpreter of a version, on the PATH or in pyenv, whose shims run only activated versions."""
+    """Return the interpreter of a version, from the PATH or from pyenv; None if there is none.
+
+    The folders of pyenv are searched because its shims run only activated versions.
+    """
     pyenv = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv"))
     on_path = shutil.which(f"python{version}")
     candidates = [Path(on_path)] if on_path else []
@@ -73,7 +76,7 @@ def _answers(python: Path, version: str) -> bool:
 
 
 def run(command: Iterable[str | Path], folder: Path) -> str:
-    """Run a command in a folder, without the repository on Python's path. Returns its output.
+    """Run a command in a folder, without the repository on Python's path. Return its output.
 
     Raises:
         SystemExit: The command failed; the message contains its output.
@@ -91,7 +94,7 @@ def try_out(file: Path, python: Path, folder: Path) -> None:
     """Install a release file in an empty environment, and compute depth and a view of the example pair.
 
     Raises:
-        SystemExit: A step failed, or another package than the installed one was imported.
+        SystemExit: A step failed, or the imported package is not the installed one.
     """
     environment = folder / "env"
     run([python, "-m", "venv", environment], folder)
@@ -106,11 +109,11 @@ def try_out(file: Path, python: Path, folder: Path) -> None:
     run([command, "view", *pair, "--position", "0.5", "--out", "view.png"], folder)
     for made in ("depth/disparity.pfm", "depth/depth.png", "depth/report.html", "view.png"):
         if not (folder / made).is_file():
-            raise SystemExit(f"{file.name}: expected {made} of its commands, found none")
+            raise SystemExit(f"{file.name}: expected its commands to write {made}, found no such file")
 
 
 def main(wheel: Path, sdist: Path) -> None:
-    """Check both files.
+    """Check a wheel and a source distribution.
 
     Raises:
         SystemExit: A file differs from the repository, does not install or does not run.
@@ -120,7 +123,7 @@ def main(wheel: Path, sdist: Path) -> None:
     print(f"{wheel.name}, {sdist.name}: all files of the repository and no others")
     pythons = {version: python_here(version) for version in VERSIONS}
     if pythons[VERSIONS[0]] is None:
-        raise SystemExit(f"Python {VERSIONS[0]}, the oldest that is supported: not on this machine")
+        raise SystemExit(f"Python {VERSIONS[0]}, the oldest supported version: not on this machine")
     for version, python in pythons.items():
         if python is None:
             print(f"Python {version}: not on this machine")

@@ -1,4 +1,4 @@
-"""Compare the tests of two commits: how many tests and asserts each has, and which tests are gone or new.
+"""Compare the tests of two commits: the numbers of tests and asserts, and the removed and added tests.
 
 python -m release.compare_tests 8012339~1 HEAD
 """
@@ -12,13 +12,13 @@ import typer
 
 
 def read_test_files(commit: str) -> list[str]:
-    """Return the sources of all Python files below `tests` in a commit."""
+    """Return the sources of all Python files below `tests` at a commit."""
     listed = _run_git("ls-tree", "-r", "--name-only", commit, "tests").splitlines()
     return [_run_git("show", f"{commit}:{path}") for path in listed if path.endswith(".py")]
 
 
 def count_tests(sources: list[str]) -> tuple[Counter[str], int]:
-    """Count the test functions by name, and all `assert` statements."""
+    """Return the number of test functions by name, and the number of `assert` statements."""
     names: Counter[str] = Counter()
     asserts = 0
     for node in (node for source in sources for node in ast.walk(ast.parse(source))):
@@ -34,10 +34,10 @@ def _run_git(*arguments: str) -> str:
 
 
 def main(
-    old: Annotated[str, typer.Argument(help="A commit, before.")],
-    new: Annotated[str, typer.Argument(help="A commit, after.")] = "HEAD",
+    old: Annotated[str, typer.Argument(help="Older commit.")],
+    new: Annotated[str, typer.Argument(help="Newer commit.")] = "HEAD",
 ) -> None:
-    """Print both counts, then the tests that are gone (-) and new (+). A renamed test is one of each."""
+    """Print both counts, then the removed (-) and added (+) tests. A renamed test appears in both lists."""
     (old_names, old_asserts), (new_names, new_asserts) = (
         count_tests(read_test_files(commit)) for commit in (old, new)
     )

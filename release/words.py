@@ -1,4 +1,4 @@
-"""Random sample of the package's docstrings and error messages, for a reader who judges their English.
+"""Random sample of the package's docstrings and error messages, for a review of their English.
 
 python -m release.words --seed 1
 """
@@ -16,14 +16,14 @@ _DOCUMENTED = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
 
 
 def docstrings(tree: ast.Module) -> Iterator[tuple[int, str]]:
-    """Yield line and text of each docstring."""
+    """Yield the line and the text of each docstring."""
     for node in ast.walk(tree):
         if isinstance(node, _DOCUMENTED) and (text := ast.get_docstring(node)):
             yield node.body[0].lineno, text
 
 
 def error_messages(tree: ast.Module) -> Iterator[tuple[int, str]]:
-    """Yield line and source of each raised error with a message."""
+    """Yield the line and the source of each raised error that has a message."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):
             texts = (part for part in ast.walk(node.exc) if isinstance(part, ast.Constant))
@@ -32,7 +32,7 @@ def error_messages(tree: ast.Module) -> Iterator[tuple[int, str]]:
 
 
 def draw(seed: int, count: int, kind: str) -> list[str]:
-    """Draw a random sample of docstrings or errors, each with its place, in the order of the files."""
+    """Return a random sample of docstrings or errors, each with its file and line, sorted by file."""
     find = {"docstrings": docstrings, "errors": error_messages}[kind]
     found = [
         f"{path.relative_to(ROOT)}:{line}: {text}"
@@ -43,11 +43,11 @@ def draw(seed: int, count: int, kind: str) -> list[str]:
 
 
 def main(
-    seed: Annotated[int, typer.Option(help="Random seed; only it and the sources decide.")] = 1,
+    seed: Annotated[int, typer.Option(help="Random seed of the sample.")] = 1,
     docstring_count: int = 100,
     error_count: int = 40,
 ) -> None:
-    """Print a random sample of docstrings and of errors."""
+    """Print a random sample of docstrings and one of errors."""
     for kind, count in (("docstrings", docstring_count), ("errors", error_count)):
         typer.echo(f"\n# {count} {kind}, seed {seed}\n\n" + "\n\n".join(draw(seed, count, kind)))
 

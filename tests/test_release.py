@@ -1,4 +1,4 @@
-"""The check of a release: which files it misses and which it finds too many, and which Pythons it takes."""
+"""Release check: missing and untracked files, and the choice of Python interpreters."""
 
 import ast
 import re
@@ -17,7 +17,7 @@ THIS_VERSION = "{}.{}".format(*sys.version_info)
 
 
 def write_release(folder: Path, package: list[str], others: list[str]) -> tuple[Path, Path]:
-    """A wheel and a source distribution of these files, with what setuptools adds to both."""
+    """Write a wheel and a source distribution of these files, with the files that setuptools adds."""
     wheel, sdist = folder / "stereoweave-1.0-py3-none-any.whl", folder / "stereoweave-1.0.tar.gz"
     with zipfile.ZipFile(wheel, "w") as archive:
         for name in (*package, "stereoweave-1.0.dist-info/METADATA"):
@@ -30,7 +30,7 @@ def write_release(folder: Path, package: list[str], others: list[str]) -> tuple[
 
 @pytest.fixture
 def repository(tmp_path, monkeypatch) -> Path:
-    """A checkout of four files in which git tracks three, as the root of what is checked."""
+    """Return a folder of four files, of which git tracks three, and make it the root of the check."""
     root = tmp_path / "repository"
     for name in ("stereoweave/a.py", "stereoweave/b.py", "README.md", "stereoweave/left.py"):
         (root / name).parent.mkdir(parents=True, exist_ok=True)
@@ -46,7 +46,7 @@ def test_a_release_of_what_git_tracks_has_no_differences(repository, tmp_path):
     assert check.content_differences(*files) == []
 
 
-def test_files_that_are_missing_or_too_many_are_named(repository, tmp_path):
+def test_missing_and_untracked_files_are_named(repository, tmp_path):
     files = write_release(tmp_path, ["stereoweave/a.py", "stereoweave/left.py"], [])
     assert check.content_differences(*files) == [
         "stereoweave-1.0-py3-none-any.whl: stereoweave/b.py is missing",
@@ -65,7 +65,7 @@ def test_a_python_is_found_on_the_path(tmp_path, monkeypatch):
     assert check.python_here("3.99") is None
 
 
-def test_a_python_of_pyenv_is_found_where_its_shim_does_not_answer(tmp_path, monkeypatch):
+def test_a_python_of_pyenv_is_found_if_its_shim_fails(tmp_path, monkeypatch):
     shim, python = tmp_path / f"python{THIS_VERSION}", tmp_path / f"versions/{THIS_VERSION}.0/bin/python"
     shim.write_text("#!/bin/sh\nexit 127\n")
     shim.chmod(0o755)
@@ -87,7 +87,7 @@ def test_commands_do_not_see_the_repository(tmp_path, monkeypatch):
     assert check.run([sys.executable, "-c", program], tmp_path) == "False"
 
 
-def test_the_pythons_that_are_missing_are_named(tmp_path, monkeypatch, capsys):
+def test_missing_pythons_are_named(tmp_path, monkeypatch, capsys):
     tried = []
     monkeypatch.setattr(check, "content_differences", lambda *_: [])
     monkeypatch.setattr(check, "try_out", lambda file, python, _: tried.append((file.name, str(python))))
@@ -102,7 +102,7 @@ def test_the_pythons_that_are_missing_are_named(tmp_path, monkeypatch, capsys):
     ]
 
 
-def test_the_oldest_python_has_to_be_there(tmp_path, monkeypatch):
+def test_the_oldest_python_is_required(tmp_path, monkeypatch):
     monkeypatch.setattr(check, "content_differences", lambda *_: [])
     monkeypatch.setattr(check, "python_here", lambda _: None)
     with pytest.raises(SystemExit, match=r"Python 3\.11, .*: not on this machine"):
@@ -116,7 +116,7 @@ def test_the_manifest_names_each_folder_of_the_repository():
     assert grafted == sorted(folders)
 
 
-def test_a_draw_of_texts_has_all_kinds_and_depends_on_its_seed_alone():
+def test_a_sample_of_texts_depends_only_on_its_seed():
     drawn = words.draw(seed=1, count=50, kind="errors")
     assert drawn == words.draw(seed=1, count=50, kind="errors")
     assert len(set(drawn)) == 50
@@ -128,7 +128,7 @@ def test_a_draw_of_texts_has_all_kinds_and_depends_on_its_seed_alone():
     assert list(words.error_messages(tree)) == [(4, "ValueError(f'too {long}')")]
 
 
-def test_tests_and_asserts_are_counted_by_name_methods_too():
+def test_tests_and_asserts_are_counted_in_functions_and_methods():
     source = (
         "def test_a():\n    assert 1\nclass TestB:\n    def test_a(self):\n        assert 1\n        assert 2"
     )
