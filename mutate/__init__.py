@@ -1,1 +1,1 @@
-"""Mutation testing: small changes to the sources, each of which a test should notice."""
+"""Mutation testing: small changes to the sources, each of which should make a test fail."""

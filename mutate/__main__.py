@@ -1,4 +1,4 @@
-"""python -m mutate: draws mutants and reports which of them the tests notice."""
+"""Draw mutants and report which of them the tests detect: python -m mutate."""
 
 import argparse
 import csv
@@ -19,11 +19,11 @@ _COLUMNS = ("commit", "seed", "module", "drawn", "killed", "survived", "timeouts
 
 
 def main() -> int:
-    """Try the mutants; 1 if fewer than 85 % of them are killed."""
+    """Try the mutants and write the results. Return 1 if fewer than 85 % of them are killed, else 0."""
     parser = argparse.ArgumentParser(prog="python -m mutate", description=__doc__)
     parser.add_argument("--count", type=_positive, default=400, help="number of mutants")
     parser.add_argument("--seed", type=int, default=1, help="random seed of the draw")
-    parser.add_argument("--jobs", type=_positive, default=2, help="mutants tried at a time")
+    parser.add_argument("--jobs", type=_positive, default=2, help="number of mutants tried at the same time")
     options = parser.parse_args()
     root = Path.cwd()
     trials = _try_all(Session(root, root / _RUNS, options.jobs), options.count, options.seed)
@@ -53,7 +53,7 @@ def _try_all(session: Session, count: int, seed: int) -> list[Trial]:
     mutants = draw(session.root, count, seed)
     covered = session.measure(print)
     for test in covered.failed:
-        print(f"fails without any change, and is not asked: {test}")
+        print(f"fails on the unchanged sources and is skipped: {test}")
     trials = []
     for trial in session.try_all(mutants, covered, seed):
         trials.append(trial)
@@ -63,7 +63,7 @@ def _try_all(session: Session, count: int, seed: int) -> list[Trial]:
 
 
 def _rows(trials: Sequence[Trial], seed: int) -> list[dict[str, Any]]:
-    """Make a row per part of the package, and one for all."""
+    """Return one row per part of the package and one for the total."""
     git = ["git", "describe", "--always", "--dirty=+", "--exclude=*"]
     commit = subprocess.run(git, capture_output=True, text=True, check=True).stdout.strip()
     rows: list[dict[str, Any]] = []

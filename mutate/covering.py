@@ -1,4 +1,4 @@
-"""Coverage of lines by tests, and the choice of tests for a mutant."""
+"""Line coverage of each test, and selection of the tests for a mutant."""
 
 import ast
 import json
@@ -15,23 +15,23 @@ from coverage import CoverageData
 from mutate.drawing import Mutant
 from mutate.targets import TARGETS
 
-# Total time of a mutant's tests, fastest first. Shared fixtures are not counted: they are often worth their
-# time.
+# Limit on the total time of the tests of a mutant, fastest first. Shared fixtures do not count, because many
+# tests need them.
 _MOST_S = 60
-# Upper limits of classes by time. Within a class tests run file by file, because leaving a file ends its
+# Upper limits of the time classes. Within a class, tests run file by file, because leaving a file ends its
 # shared fixtures.
 _CLASSES_S = [1, 5]
 
 
 @dataclass(frozen=True)
 class Covered:
-    """Measurements of the unchanged sources.
+    """Measurements of the tests on the unchanged sources.
 
     Attributes:
-        taken_s: Seconds of each passed test, without shared fixtures.
-        shared_s: Seconds of each shared fixture of a test, by test.
-        tests: Tests that run a line, by source and line.
-        failed: Tests that failed without any change.
+        taken_s: Duration of each passed test, without shared fixtures.
+        shared_s: Durations of the shared fixtures of each test, by test and fixture.
+        tests: Tests that run each line, by source and line.
+        failed: Tests that failed on the unchanged sources.
     """
 
     taken_s: dict[str, float]
@@ -40,7 +40,7 @@ class Covered:
     failed: list[str]
 
     def choose(self, mutant: Mutant, root: Path) -> list[str]:
-        """Choose up to a minute of tests for a mutant, fast ones first."""
+        """Return the tests for a mutant, fast ones first, for up to a minute of test time."""
         found = self._covering(mutant)
         target = TARGETS[mutant.target]
         if target.elsewhere or not found:
@@ -52,7 +52,7 @@ class Covered:
         return sorted(chosen or quickest[:1], key=self._turn)
 
     def seconds(self, tests: Sequence[str]) -> float:
-        """Total seconds of tests, with each shared fixture counted once."""
+        """Return the total duration of tests in seconds, with each shared fixture counted once."""
         shared_s = {name: seconds for test in tests for name, seconds in self.shared_s[test].items()}
         return sum(shared_s.values()) + sum(self.taken_s[test] for test in tests)
 
@@ -66,9 +66,9 @@ class Covered:
 
 
 def _lines_of_statement(tree: ast.Module, line: int) -> Iterable[int]:
-    """Find the lines of the statement, or statement header, that contains a line; none outside of functions.
+    """Return the lines of the statement or statement header that contains a line; none outside functions.
 
-    Code that an import runs counts as covered by all tests of the source.
+    Code that runs on import counts as covered by all tests of the source.
     """
     inside, lines = False, range(0)
     for node in ast.walk(tree):  # outer statements first
@@ -81,7 +81,7 @@ def _lines_of_statement(tree: ast.Module, line: int) -> Iterable[int]:
 
 
 def lines_run(folder: Path, tree: Path) -> dict[str, dict[int, list[str]]]:
-    """Read which tests ran each line, by source and line, from the coverage data of all processes."""
+    """Return the tests that ran each line, by source and line, from the coverage data of all processes."""
     found: dict[str, dict[int, set[str]]] = defaultdict(lambda: defaultdict(set))
     for path in folder.glob(".coverage.*"):
         data = CoverageData(str(path))
@@ -94,12 +94,12 @@ def lines_run(folder: Path, tree: Path) -> dict[str, dict[int, list[str]]]:
 
 
 def _test(context: str) -> str:
-    # In a process that a test started, the context is pytest's "tests/test_x.py::test_y (call)".
+    # In a process that a test started, the context comes from pytest: "tests/test_x.py::test_y (call)".
     return context.rpartition(" (")[0] if context.endswith(("(setup)", "(call)", "(teardown)")) else context
 
 
 def read_covered(paths: Iterable[Path]) -> Covered:
-    """Combine the measurements of all test files, from one JSON file each."""
+    """Return the combined measurements of all test files, read from one JSON file each."""
     covered = Covered({}, {}, defaultdict(lambda: defaultdict(set)), [])
     for path in paths:
         measured: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""Random choice of mutants from a seed."""
+"""Random selection of mutants, determined by a seed."""
 
 import ast
 import random
@@ -21,15 +21,15 @@ Place = tuple[int, int]
 
 @dataclass(frozen=True, kw_only=True)
 class Mutant:
-    """A source with one change.
+    """Source file with one change.
 
     Attributes:
-        target: Part of the package, a key of TARGETS.
+        target: Part of the package, as a key of TARGETS.
         path: Source file, relative to the repository's root.
-        line: Line of the change, from 1.
+        line: Line of the change, counted from 1.
         operator: Name of the operator that made the change.
-        before: The whole source.
-        after: The whole source with the change.
+        before: Complete original source.
+        after: Complete changed source.
     """
 
     target: str
@@ -46,9 +46,9 @@ class Mutant:
 
 
 def draw(root: Path, count: int, seed: int) -> list[Mutant]:
-    """Draw mutants at places spread evenly over all sources; a higher count extends the list of a lower one.
+    """Draw mutants at random places in all sources; a higher count extends the list of a lower one.
 
-    At each place one of the operators' possible changes is drawn.
+    At each place, one of the possible changes is drawn.
     """
     available = [
         (target, path, place, changes)
@@ -73,7 +73,7 @@ def draw(root: Path, count: int, seed: int) -> list[Mutant]:
 
 
 def places(path: Path) -> dict[Place, list[tuple[str, Operator, int]]]:
-    """Find the places (line, column) where a source can be changed, with their operators and occurrences."""
+    """Return the places (line, column) where a source can be changed, with operators and occurrences."""
     source = path.read_text(encoding="utf-8")
     left_out = list(_find_left_out(ast.parse(source)))
     nodes = list(ast_nodes(get_ast(source)))
@@ -81,7 +81,7 @@ def places(path: Path) -> dict[Place, list[tuple[str, Operator, int]]]:
     for name, operator in operators().items():
         starts = ((node, start) for node in nodes for start, _ in operator.mutation_positions(node))
         for occurrence, (node, place) in enumerate(starts):
-            # The `*` before keyword-only parameters looks like a product.
+            # To the operators, the `*` before keyword-only parameters looks like a product.
             is_mark = node.parent is not None and node.parent.type == "parameters"
             if not is_mark and not any(first <= place < last for first, last in left_out):
                 found[place].append((name, operator, occurrence))
@@ -89,9 +89,9 @@ def places(path: Path) -> dict[Place, list[tuple[str, Operator, int]]]:
 
 
 def _find_left_out(tree: ast.Module) -> Iterator[tuple[Place, Place]]:
-    """Find code whose change no test should notice, and `/` between paths, which has no alternative."""
+    """Yield ranges of code that no test needs to check, and of `/` between paths, which has no opposite."""
     for node in ast.walk(tree):
-        # zip's `strict` is an assertion.
+        # The argument `strict` of zip is an assertion.
         is_assertion = isinstance(node, ast.keyword) and node.arg == "strict"
         is_for_types = isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
         if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Div) and _is_path(node.left):
@@ -111,7 +111,7 @@ def _is_path(node: ast.expr) -> bool:
 
 
 def _differs(before: str, after: str) -> bool:
-    """Whether the changed source is valid Python and a different program."""
+    """Return whether the changed source is valid Python and a different program."""
     try:
         return ast.dump(ast.parse(before)) != ast.dump(ast.parse(after))
     except SyntaxError:

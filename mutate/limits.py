@@ -1,8 +1,8 @@
-"""A pytest plugin that limits the memory of the tests and of each process that they start."""
+"""Pytest plugin that limits the memory of the tests and of every process that they start."""
 
 import resource
 
-# A changed loop may fill a list forever.
+# A mutated loop may append to a list forever.
 _MOST_BYTES = 8 * 2**30
 
 

@@ -1,7 +1,7 @@
-"""A pytest plugin that records each test's lines, time and result.
+"""Pytest plugin that records the covered lines, the duration and the result of each test.
 
-The variable COVERAGE_PROCESS_START starts coverage, in processes that tests start too. In these, the context
-is the test that pytest names in PYTEST_CURRENT_TEST.
+The variable COVERAGE_PROCESS_START starts coverage, even in the processes that tests start. In those, the
+context is the test that pytest names in PYTEST_CURRENT_TEST.
 """
 
 import json
@@ -16,7 +16,7 @@ from coverage import Coverage
 
 TIMES_FILE = "STEREOWEAVE_MUTATE_TIMES"
 
-# Times of the fixtures that are set up for each test, and of those that tests share.
+# Set-up times of fixtures: first those set up for each test, then those that tests share.
 _own_fixture_s: dict[str, float] = {}
 _shared_fixture_s: dict[str, float] = {}
 _fixtures: dict[str, list[str]] = {}
@@ -26,7 +26,7 @@ _failed: set[str] = set()
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, Any, Any]:
-    """Attribute all lines that run until the test is over to this test."""
+    """Attribute all lines that run during a test, including set-up and tear-down, to that test."""
     coverage = Coverage.current()
     assert coverage is not None
     coverage.switch_context(item.nodeid)
@@ -39,7 +39,7 @@ def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, Any, Any]:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_fixture_setup(fixturedef: pytest.FixtureDef[Any]) -> Generator[None, Any, Any]:
-    """Record the time of a fixture's set-up."""
+    """Record the set-up time of a fixture."""
     start_s = time.perf_counter()
     try:
         return (yield)
@@ -50,7 +50,7 @@ def pytest_fixture_setup(fixturedef: pytest.FixtureDef[Any]) -> Generator[None, 
 
 
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:
-    """Record the time of the test itself, and whether any part of it fails."""
+    """Record the time of the test itself, and whether the test, its set-up or its tear-down fails."""
     if report.when == "call":
         _call_s[report.nodeid] = report.duration
     if not report.passed:
@@ -58,7 +58,7 @@ def pytest_runtest_logreport(report: pytest.TestReport) -> None:
 
 
 def pytest_sessionfinish() -> None:
-    """Write the times of each passed test and of its shared fixtures, and the failed tests."""
+    """Write the times of all passed tests and of their shared fixtures, and the names of all failed tests."""
     passed = _call_s.keys() - _failed
     taken_s = {
         test: _call_s[test] + sum(_own_fixture_s.get(name, 0) for name in _fixtures[test]) for test in passed

@@ -1,8 +1,8 @@
-"""Mutation operators: some of Cosmic Ray's, and our own for changes that it lacks.
+"""Mutation operators: some from Cosmic Ray, and others for changes that Cosmic Ray lacks.
 
-Cosmic Ray can replace each binary operator by each of eleven others. Every test would notice most of these
-(`<<` of two floats), so only plausible ones are used. No test can notice that a cache is gone, so decorators
-stay.
+Cosmic Ray can replace each binary operator with eleven others. Any test would detect most of these, such as
+`<<` between two floats, so only plausible replacements are used. Decorators are never removed, because no
+test can detect a missing cache.
 """
 
 import ast
@@ -34,7 +34,7 @@ _OF_COSMIC_RAY = (
 
 
 class _LeafOperator(Operator):
-    """Operator on single leaves of the syntax tree."""
+    """Operator that changes single leaves of the syntax tree."""
 
     def mutation_positions(self, node: NodeOrLeaf) -> Iterator[Position]:
         if self.applies(node):
@@ -46,15 +46,15 @@ class _LeafOperator(Operator):
 
     @abstractmethod
     def applies(self, node: NodeOrLeaf) -> bool:
-        """Whether this operator changes the leaf."""
+        """Return whether this operator changes the leaf."""
 
     @abstractmethod
     def replacement(self, value: str) -> str:
-        """Return the replacement of the leaf's text."""
+        """Return the replacement for the text of a leaf."""
 
 
 class ChangeNumber(_LeafOperator):
-    """Adds 1 to a small number, multiplies a large one by 1,000."""
+    """Operator that adds 1 to a small number and multiplies a large one by 1,000."""
 
     def applies(self, node: NodeOrLeaf) -> bool:
         return isinstance(node, Number)
@@ -69,7 +69,7 @@ class ChangeNumber(_LeafOperator):
 
 
 class LowerNumber(ChangeNumber):
-    """Subtracts 1 from a small number, divides a large one by 1,000."""
+    """Operator that subtracts 1 from a small number and divides a large one by 1,000."""
 
     def replacement(self, value: str) -> str:
         number = ast.literal_eval(value)
@@ -83,7 +83,7 @@ class LowerNumber(ChangeNumber):
 
 
 class SwapFunction(_LeafOperator):
-    """Calls a function's opposite."""
+    """Operator that replaces a function with its opposite."""
 
     PAIRS = (("min", "max"), ("minimum", "maximum"), ("any", "all"), ("floor", "ceil"), ("ones", "zeros"))
     OPPOSITES = dict(PAIRS) | {second: first for first, second in PAIRS}
@@ -103,7 +103,7 @@ class SwapFunction(_LeafOperator):
 
 
 class ReplaceIn(_LeafOperator):
-    """Replaces `in` by `not in`."""
+    """Operator that replaces `in` with `not in`."""
 
     def applies(self, node: NodeOrLeaf) -> bool:
         in_comparison = node.parent is not None and node.parent.type == "comparison"
@@ -118,7 +118,7 @@ class ReplaceIn(_LeafOperator):
 
 
 class ReplaceNotIn(Operator):
-    """Replaces `not in` by `in`."""
+    """Operator that replaces `not in` with `in`."""
 
     def mutation_positions(self, node: NodeOrLeaf) -> Iterator[Position]:
         if node.type == "comp_op" and node.get_code().split() == ["not", "in"]:
@@ -133,7 +133,7 @@ class ReplaceNotIn(Operator):
 
 
 class RemoveCall(Operator):
-    """Removes a call whose result is not used."""
+    """Operator that removes a call whose result is not used."""
 
     def mutation_positions(self, node: NodeOrLeaf) -> Iterator[Position]:
         if node.type == "simple_stmt" and isinstance(node, PythonNode):
@@ -152,7 +152,7 @@ class RemoveCall(Operator):
 
 
 class CatchNothing(Operator):
-    """Catches no exception."""
+    """Operator that makes an `except` clause catch nothing."""
 
     def mutation_positions(self, node: NodeOrLeaf) -> Iterator[Position]:
         if node.type == "except_clause":
@@ -172,7 +172,7 @@ class CatchNothing(Operator):
 
 
 class RemoveTranspose(Operator):
-    """Replaces a transpose by the matrix itself."""
+    """Operator that replaces a transposed matrix with the matrix itself."""
 
     def mutation_positions(self, node: NodeOrLeaf) -> Iterator[Position]:
         if node.type == "trailer" and node.get_code() == ".T":

@@ -1,4 +1,4 @@
-"""A resumable run over mutants."""
+"""Resumable run of the tests on many mutants."""
 
 import hashlib
 import json
@@ -21,13 +21,13 @@ from mutate.trees import Tree, repository_files
 KILLED, SURVIVED, TIMEOUT = "killed", "survived", "timeout"
 
 _MEASURED_WITHIN_S = 900
-# A busy machine takes longer than when the tests were measured.
+# Tests on a busy machine take longer than when they were measured.
 _TIMES_AS_LONG, _START_S = 4, 60
-# Tests that call nearly all kernels of Numba.
+# Tests that call nearly all Numba kernels.
 _COMPILING = ("tests/rendering/test_camera_motion.py", "tests/rendering/test_synthesize.py")
-# Pytest's exit code if it finds no test.
+# Exit code of pytest if it collects no tests.
 _NO_TESTS = 5
-# Only these files can change a test's result.
+# Only these files can change the result of a test.
 _PARTS = ("stereoweave/", "tests/", "examples/", "mutate/", "pyproject.toml")
 
 Report = Callable[[str], None]
@@ -35,7 +35,7 @@ Report = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Trial:
-    """Result of a mutant: killed, survived or timeout; with the time taken and the number of tests chosen."""
+    """Result of trying a mutant: the outcome, the time taken, and the number of selected tests."""
 
     mutant: Mutant
     outcome: str
@@ -44,7 +44,7 @@ class Trial:
 
 
 class Session:
-    """Run on one state of sources and tests; a folder stores its measurements and outcomes."""
+    """Run on one state of the sources and tests, with a folder that stores its measurements and outcomes."""
 
     def __init__(self, root: Path, runs: Path, jobs: int) -> None:
         self.root = root
@@ -56,7 +56,7 @@ class Session:
             self._free.put(tree)
 
     def measure(self, report: Report) -> Covered:
-        """Return which tests cover which lines; measure the test files that are not measured yet."""
+        """Return the coverage of all tests; measure the test files that have not been measured yet."""
         files = sorted({file for target in TARGETS.values() for file in target.test_files(self.root)})
         with self._open_pool() as pool:
             if any(not self._measurements_path(file).exists() for file in files):
@@ -65,7 +65,7 @@ class Session:
             return read_covered(pool.map(lambda file: self._measure_file(file, report), files))
 
     def try_all(self, mutants: Sequence[Mutant], covered: Covered, seed: int) -> Iterator[Trial]:
-        """Yield the outcomes as they arrive, after those of an earlier run of this session."""
+        """Yield the trials known from an earlier run of this session, then the new ones as they finish."""
         kept = self.folder / f"outcomes-{seed}.jsonl"
         known = _read_outcomes(kept)
         waiting = []
@@ -85,7 +85,7 @@ class Session:
 
     @contextmanager
     def _open_pool(self) -> Iterator[ThreadPoolExecutor]:
-        """Open a pool with one thread per tree; on an error, end the running tests."""
+        """Open a pool with one thread per tree; stop any running tests at the end."""
         pool = ThreadPoolExecutor(len(self._trees))
         try:
             yield pool
@@ -104,7 +104,7 @@ class Session:
             self._free.put(tree)
 
     def _compile(self, tree: Tree) -> None:
-        """Compile the kernels for a copy, so that the first test to call them is not measured as slow."""
+        """Compile the kernels for a copy, so that compilation does not count as time of the first test."""
         words = [file for file in _COMPILING if (tree.folder / file).exists()]
         if words:
             tree.pytest(words, self.folder / f"log-{tree.folder.name}.txt", _MEASURED_WITHIN_S)
@@ -113,13 +113,13 @@ class Session:
         return self.folder / "covered" / f"{_flatten(file)}.json"
 
     def _measure_file(self, file: str, report: Report) -> Path:
-        """Return the JSON file with a test file's measurements; measure it if there is none."""
+        """Return the JSON file with the measurements of a test file, which is measured if that is missing."""
         kept = self._measurements_path(file)
         if not kept.exists():
             with self._borrow_tree() as tree, tempfile.TemporaryDirectory(dir=self.folder) as folder:
                 report(f"measuring {file}")
                 measured = _measure(tree, file, Path(folder))
-                # Written completely or not at all.
+                # The file is written completely or not at all.
                 partial = Path(folder, "measured.json")
                 partial.write_text(json.dumps(measured), encoding="utf-8")
                 partial.replace(kept)
@@ -140,7 +140,7 @@ class Session:
 
 
 def _measure(tree: Tree, file: str, folder: Path) -> dict[str, Any]:
-    """Measure the time and the lines of each test of a file."""
+    """Return the durations and the covered lines of all tests in a file."""
     sources = [tree.folder / path for target in TARGETS.values() for path in target.source_files(tree.folder)]
     settings, times = folder / "coveragerc", folder / "times.json"
     settings.write_text(
@@ -152,17 +152,17 @@ def _measure(tree: Tree, file: str, folder: Path) -> dict[str, Any]:
     log = folder.parent / f"log-{_flatten(file)}.txt"
     tree.pytest(["-p", "mutate.measuring", file], log, _MEASURED_WITHIN_S, **variables)
     if not times.exists():
-        raise RuntimeError(f"{log}: expected tests that end, found that they were stopped")
+        raise RuntimeError(f"{log}: expected pytest to finish, found that it crashed or ran out of time")
     return json.loads(times.read_text(encoding="utf-8")) | {"lines": lines_run(folder, tree.folder)}
 
 
 def _flatten(file: str) -> str:
-    """Convert a path to a file name."""
+    """Return the path of a Python file as a plain name, with - in place of /."""
     return file.removesuffix(".py").replace("/", "-")
 
 
 def _read_outcomes(path: Path) -> dict[int, dict[str, Any]]:
-    """Read the outcomes of an earlier run, by the mutants' turns."""
+    """Return the outcomes of an earlier run, by the position of the mutant in the draw."""
     if not path.exists():
         return {}
     lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
@@ -170,7 +170,7 @@ def _read_outcomes(path: Path) -> dict[int, dict[str, Any]]:
 
 
 def _digest(root: Path) -> str:
-    """Hash of sources and tests, 12 hexadecimal digits."""
+    """Return a hash of the sources and tests as 12 hexadecimal digits."""
     digest = hashlib.sha256()
     for name in repository_files(root):
         if name.startswith(_PARTS):

@@ -5,13 +5,13 @@ from typing import NamedTuple
 
 
 class Target(NamedTuple):
-    """A part of the package, by glob patterns.
+    """Part of the package, defined by glob patterns.
 
     Attributes:
-        sources: Files below stereoweave/.
-        tests: Test files below tests/. The coverage of each test is measured.
-        elsewhere: Whether some code runs in processes that are killed before they write their coverage, as
-            Ray's are. Then all tests of the first pattern count as covering each line.
+        sources: Source files below stereoweave/.
+        tests: Test files below tests/, whose coverage is measured test by test.
+        elsewhere: Whether some code runs in processes that are killed before they write their coverage, such
+            as Ray workers. If so, every test of the first pattern counts as covering every line.
     """
 
     sources: tuple[str, ...]
@@ -19,15 +19,15 @@ class Target(NamedTuple):
     elsewhere: bool = False
 
     def source_files(self, root: Path) -> list[str]:
-        """Find the sources, relative to the repository's root."""
+        """Return the source files, relative to the root of the repository."""
         return _found(root, "stereoweave", self.sources)
 
     def test_files(self, root: Path) -> list[str]:
-        """Find the test files, relative to the repository's root."""
+        """Return the test files, relative to the root of the repository."""
         return _found(root, "tests", self.tests)
 
     def own_test_files(self, root: Path) -> list[str]:
-        """Find the test files of the first pattern."""
+        """Return the test files of the first pattern, relative to the root of the repository."""
         return _found(root, "tests", self.tests[:1])
 
 

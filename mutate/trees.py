@@ -12,10 +12,10 @@ from pathlib import Path
 
 
 class Tree:
-    """A copy of the repository on disk, because some tests start processes.
+    """Copy of the repository on disk, which is needed because some tests start processes.
 
     Attributes:
-        folder: Folder of the copy; the same in each run, so that Numba finds its compiled kernels.
+        folder: Folder of the copy, the same in each run, so that Numba finds its compiled kernels.
     """
 
     def __init__(self, root: Path, folder: Path) -> None:
@@ -29,7 +29,7 @@ class Tree:
             shutil.copy2(root / name, copy)
 
     def pytest(self, words: Sequence[str], log: Path, limit_s: float, **variables: str) -> int | None:
-        """Run pytest on the copy. Returns its exit code, or None if it did not end in time."""
+        """Run pytest on the copy. Return its exit code, or None if it did not finish in time."""
         environment = os.environ | {
             "PYTHONPATH": str(self.folder),
             "STEREOWEAVE_TESTDATA": self._testdata,
@@ -37,7 +37,7 @@ class Tree:
             **variables,
         }
         pytest = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "mutate.limits"]
-        # A short name, because socket names have at most 107 bytes.
+        # The prefix is short, because socket names have at most 107 bytes.
         with (
             tempfile.TemporaryDirectory(prefix="swm-", ignore_cleanup_errors=True) as temporary,
             log.open("wb") as out,
@@ -58,7 +58,7 @@ class Tree:
                 self.stop()
 
     def stop(self) -> None:
-        """End the running tests and their processes."""
+        """Kill the running tests and their processes."""
         if self._running:
             with suppress(ProcessLookupError):
                 os.killpg(self._running.pid, signal.SIGKILL)
@@ -66,10 +66,10 @@ class Tree:
 
     @contextmanager
     def replace_source(self, path: str, source: str, turn: int) -> Iterator[None]:
-        """Replace a source within the block, with a modification time of its own.
+        """Replace a source file within the block, with a unique modification time.
 
-        Python and Numba reuse compiled code as long as a source has the same size and the same time in whole
-        seconds.
+        Python and Numba reuse compiled code as long as the size of a source file and its modification time in
+        whole seconds stay the same.
         """
         file = self.folder / path
         original, status = file.read_bytes(), file.stat()
@@ -84,7 +84,7 @@ class Tree:
 
 
 def repository_files(root: Path) -> list[str]:
-    """List the files of the repository, committed or not."""
+    """Return the files of the repository, committed or not, except ignored ones."""
     command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
     listed = subprocess.run(command, cwd=root, capture_output=True, text=True, check=True).stdout
     return sorted(name for name in listed.split("\0") if name and (root / name).is_file())

@@ -26,7 +26,7 @@ TEST = """
 from stereoweave.rendering.renderer import clipped, next_of
 
 
-def test_what_is_too_much_is_clipped():
+def test_large_values_are_clipped():
     assert clipped(7, 3) == 3
     assert clipped(2, 3) == 2
 
@@ -38,7 +38,7 @@ def test_the_next_one_is_greater():
 
 @pytest.fixture
 def repository(tmp_path):
-    """A repository of one source, with tests of one part of it that say much and of one that say little."""
+    """Return a repository of two functions, one with a strict test and one with a weak test."""
     root = tmp_path / "repository"
     shutil.copytree(ROOT / "mutate", root / "mutate", ignore=shutil.ignore_patterns("__pycache__"))
     files = {"stereoweave/rendering/renderer.py": SOURCE, "tests/rendering/test_renderer.py": TEST}
@@ -64,7 +64,7 @@ def mutate(root: Path) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_a_mutant_that_no_test_notices_survives_and_what_was_tried_is_not_tried_again(repository):
+def test_a_mutant_that_no_test_detects_survives_and_a_second_run_repeats_no_trial(repository):
     assert {mutant.line for mutant in draw(repository, 3, seed=1)} == {3, 7}
     ended = mutate(repository)
     assert ended.stderr == ""
@@ -87,13 +87,13 @@ def test_a_mutant_that_no_test_notices_survives_and_what_was_tried_is_not_tried_
 
 
 @pytest.mark.parametrize("operator", OUR_OWN)
-def test_every_operator_makes_what_its_examples_say(operator):
+def test_every_operator_agrees_with_its_examples(operator):
     for example in operator.examples():
         changed = mutate_code(example.pre_mutation_code, operator(), example.occurrence)
         assert changed == example.post_mutation_code
 
 
-def test_annotations_text_and_joined_paths_are_not_changed(tmp_path):
+def test_annotations_texts_and_joined_paths_are_not_mutated(tmp_path):
     source = tmp_path / "source.py"
     source.write_text(
         "def f(*, x: int | None = 1) -> list[1]:\n"
@@ -105,7 +105,7 @@ def test_annotations_text_and_joined_paths_are_not_changed(tmp_path):
     assert sorted(places(source)) == [(1, 25), (2, 16), (2, 18), (3, 7), (3, 9), (3, 11)]
 
 
-def test_a_lower_count_is_the_beginning_of_a_higher_one_and_another_seed_another_draw(repository):
+def test_a_lower_count_draws_a_prefix_and_another_seed_draws_other_mutants(repository):
     three, four = draw(repository, 3, seed=1), draw(repository, 4, seed=1)
     assert four[:3] == three
     assert draw(repository, 4, seed=2) != four
