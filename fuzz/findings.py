@@ -1,4 +1,4 @@
-"""Findings of the fuzzer, which are identified by their place, reduced to small files, and stored."""
+"""Findings of the fuzzer: identification by place in the code, reduction to small files, and storage."""
 
 import hashlib
 import re
@@ -56,7 +56,7 @@ def _place(frames: str) -> str:
 
 
 def shrink(content: bytes, fails_alike: Callable[[bytes], bool], seconds: float) -> bytes:
-    """Return the content without the parts, large ones first, whose removal leaves the failure unchanged."""
+    """Remove parts of the content, large ones first, as long as the failure stays the same."""
     end_s, step = monotonic() + seconds, len(content) // 2
     while step:
         start = 0
@@ -79,5 +79,5 @@ def keep(finding: Finding, folder: Path) -> Path:
 
 
 def list_findings(folder: Path) -> dict[Path, str]:
-    """Return the finding files in a folder, each with the name that the file had in its case."""
+    """Return the files of the findings in a folder, each with its original file name."""
     return {path: path.name.partition("-")[2] for path in sorted(folder.glob("*-*"))}

@@ -1,4 +1,4 @@
-"""HTTP requests read from files and passed to an ASGI application as a server would do."""
+"""HTTP requests read from files and passed to an ASGI application as by a server."""
 
 import asyncio
 from collections.abc import Awaitable, Callable, MutableMapping
@@ -15,7 +15,7 @@ Application = Callable[
 
 
 class ServerError(Exception):
-    """Response that reports an internal server error, or missing response."""
+    """Error raised for a response with status 500 or a missing response."""
 
 
 def request_bytes(method: str, path: str, **form: Any) -> bytes:

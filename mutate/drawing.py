@@ -89,7 +89,7 @@ def places(path: Path) -> dict[Place, list[tuple[str, Operator, int]]]:
 
 
 def _find_left_out(tree: ast.Module) -> Iterator[tuple[Place, Place]]:
-    """Yield ranges of code that no test needs to check, and of `/` between paths, which has no opposite."""
+    """Yield the ranges of code that are never mutated, such as annotations, errors and `/` between paths."""
     for node in ast.walk(tree):
         # The argument `strict` of zip is an assertion.
         is_assertion = isinstance(node, ast.keyword) and node.arg == "strict"

@@ -104,7 +104,7 @@ class Session:
             self._free.put(tree)
 
     def _compile(self, tree: Tree) -> None:
-        """Compile the kernels for a copy, so that compilation does not count as time of the first test."""
+        """Compile the kernels for a copy, so that compilation does not count towards the first test."""
         words = [file for file in _COMPILING if (tree.folder / file).exists()]
         if words:
             tree.pytest(words, self.folder / f"log-{tree.folder.name}.txt", _MEASURED_WITHIN_S)
@@ -113,7 +113,7 @@ class Session:
         return self.folder / "covered" / f"{_flatten(file)}.json"
 
     def _measure_file(self, file: str, report: Report) -> Path:
-        """Return the JSON file with the measurements of a test file, which is measured if that is missing."""
+        """Return the JSON file with the measurements of a test file, after measuring it if necessary."""
         kept = self._measurements_path(file)
         if not kept.exists():
             with self._borrow_tree() as tree, tempfile.TemporaryDirectory(dir=self.folder) as folder:

@@ -76,7 +76,7 @@ def visit(content: bytes, gate: Callable[[ASGIApp], ASGIApp] = OwnFiles) -> int 
     given = [_OWN] if _VISITOR["Cookie"].encode() in content else []
     for path in page.asked:
         if path not in given:
-            raise LeakError(f"status {status}, and the page was asked for {path!r}")
+            raise LeakError(f"a request for {path!r} reached the page, which answered with status {status}")
     return status
 
 

@@ -1,4 +1,4 @@
-"""Shards of rendered pairs, with correct or wrong checksums."""
+"""Shards of rendered pairs, with valid or invalid checksums."""
 
 from pathlib import Path
 
