@@ -1,1 +1,1 @@
-"""The machine: threads, processes, compiled kernels, Ray."""
+"""Use of the machine: threads, processes, compiled kernels and Ray."""

@@ -1,4 +1,4 @@
-"""A function in a child process that can be killed in the middle of a call and replaced."""
+"""Functions in child processes, which can be killed in the middle of a call and replaced."""
 
 import os
 import pickle
@@ -22,7 +22,7 @@ _Reply = tuple[Any, Exception | None]
 
 
 class ProcessDiedError(StereoweaveError):
-    """The process ended in the middle of a call: it crashed, or memory ran out."""
+    """Error for a process that ended in the middle of a call, because it crashed or memory ran out."""
 
 
 class ChildProcess:
@@ -30,7 +30,7 @@ class ChildProcess:
 
     Args:
         make: Called once in the child; returns the function. It is pickled, as are arguments and results.
-        folder: For the child's temporary files; removed when the child ends.
+        folder: Folder for the child's temporary files; removed when the child ends.
     """
 
     def __init__(self, make: Callable[[], Function], folder: Path) -> None:
@@ -39,17 +39,18 @@ class ChildProcess:
         self._start()
 
     def __call__(self, argument: Any, timeout_s: float | None) -> Any:
-        """Call the function, for at most `timeout_s`, and return its result.
+        """Call the function for at most `timeout_s` seconds, and return its result.
 
         Raises:
-            TimeoutError: If the call took longer, and the process was replaced; or if it is still starting.
-            ProcessDiedError: If the process ended by itself, and was replaced.
-            Exception: The error that the function or `make` raised.
+            TimeoutError: If the process has not started in time, or the call takes too long. In the latter
+                case, the process is replaced.
+            ProcessDiedError: If the process ends by itself; it is then replaced.
+            Exception: Any error that the function or `make` raises.
         """
         start_s = time.monotonic()
         wait([self._started], timeout_s)
         left_s = None if timeout_s is None else start_s + timeout_s - time.monotonic()
-        late = TimeoutError(f"expected to be done within {timeout_s or 0:.3g} s, and was not")
+        late = TimeoutError(f"expected a result within {timeout_s or 0:.3g} s, found none")
         if not self._started.done() or (left_s is not None and left_s <= 0):
             raise late
         self._open(self._started)
@@ -63,11 +64,11 @@ class ChildProcess:
 
     @property
     def pid(self) -> int:
-        """The id of the process."""
+        """The process ID of the child."""
         return self._process.pid
 
     def close(self) -> None:
-        """End the process."""
+        """End the child process."""
         self._end()
         self._exchanges.shutdown()
 
@@ -80,18 +81,18 @@ class ChildProcess:
         self._started = self._exchanges.submit(_exchange, self._process, self._make)
 
     def _make_folder(self) -> None:
-        """Make the folder if it is missing: cleaners of /tmp remove folders that are unused for days."""
+        """Make the folder if it is missing, because cleaners of /tmp remove folders unused for days."""
         self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
 
     def _open(self, reply: Future[_Reply]) -> Any:
-        """Return the result in a reply that has arrived, or raise its error."""
+        """Return the result of a reply that has arrived, or raise its error."""
         try:
             result, error = reply.result()
         # ValueError: the pipes are closed, because the process ended and could not be replaced.
         except (OSError, EOFError, ValueError, pickle.UnpicklingError):
             status = self._replace()
             raise ProcessDiedError(
-                f"expected the process that works on the request to finish, found that it ended ({status}); "
+                f"the process that worked on the request ended early ({status}): "
                 "a file in the request made it crash, or memory ran out"
             ) from None
         if error is not None:
@@ -99,7 +100,7 @@ class ChildProcess:
         return result
 
     def _replace(self) -> str:
-        """Replace the process; return how the old one ended."""
+        """Replace the process; return the exit code or signal with which the old one ended."""
         status = self._end()
         self._start()
         return f"exit code {status}" if status >= 0 else signal.Signals(-status).name
@@ -109,7 +110,7 @@ class ChildProcess:
         self._process.kill()
         status = self._process.wait()
         for pipe in filter(None, (self._process.stdin, self._process.stdout)):
-            with suppress(BrokenPipeError):  # an argument that it did not finish reading
+            with suppress(BrokenPipeError):  # the process had not read its whole argument
                 pipe.close()
         shutil.rmtree(self._folder, ignore_errors=True)
         return status
@@ -123,7 +124,7 @@ def _exchange(process: Any, message: bytes) -> _Reply:
 
 
 def _work() -> None:
-    """Main loop of the child: make the function, then call it with each message from the standard input."""
+    """Make the function, then call it with each message from standard input; this never returns."""
     replies = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # keep libraries' output out of the replies
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent handles it
@@ -146,13 +147,13 @@ def _receive(messages: "queue.SimpleQueue[bytes]") -> None:
 
 
 def _reply(function: Function, argument: bytes) -> bytes:
-    """The function's result, or the error that it raised, pickled."""
+    """Call a function with a pickled argument, and return its result or error, pickled."""
     try:
         return pickle.dumps((function(pickle.loads(argument)), None))
     except Exception as error:
         try:
             return pickle.dumps((None, error))
-        except Exception:  # an error that cannot be pickled: it holds an open file, for example
+        except Exception:  # the error cannot be pickled: it may hold an open file
             return pickle.dumps((None, RuntimeError(repr(error))))
 
 

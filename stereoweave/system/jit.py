@@ -1,8 +1,8 @@
-"""Compiler settings of the kernels (loops over pixels, compiled by Numba), and the cache of compiled code.
+"""Compiler settings for the kernels (loops over pixels, compiled by Numba), and a cache of compiled code.
 
-Compiled code is kept in the user's cache folder, never in the package, so that an installation may be
-read-only. Kernels that process whole rows use float32 and no branches, so that the compiler vectorises them:
-three times as fast.
+Compiled code is kept in the user's cache folder, never in the package, because an installation may be
+read-only. Kernels that process whole rows use float32 and no branches: the compiler can then vectorise them,
+which makes them three times as fast.
 """
 
 import functools
@@ -28,19 +28,22 @@ def kernel(function: Callable[..., None]) -> Callable[..., None]:
     """Compile `function` at its first call, or load the code that an earlier process compiled."""
     settings: typing.Any = config
     chosen_by_user = settings.CACHE_DIR
-    # Numba reads this setting while it decorates. Restore it for functions of other packages.
+    # Numba reads this setting when it decorates a function. Restore it for functions of other packages.
     try:
         settings.CACHE_DIR = str(Path(chosen_by_user or cache_folder()) / _sources_digest())
         return njit(cache=True, **_SETTINGS)(function)
     except RuntimeError:
-        # No home folder, or none that can be written: compile in every process instead.
+        # There is no writable cache folder: compile in every process instead.
         return njit(**_SETTINGS)(function)
     finally:
         settings.CACHE_DIR = chosen_by_user
 
 
 def cache_folder() -> Path:
-    """The default folder of compiled kernels, in the user's cache folder; NUMBA_CACHE_DIR overrides it."""
+    """Return the default folder of compiled kernels, in the user's cache folder.
+
+    The environment variable NUMBA_CACHE_DIR overrides it.
+    """
     if sys.platform == "win32":
         base = os.environ.get("LOCALAPPDATA") or "~/AppData/Local"
     elif sys.platform == "darwin":
@@ -52,9 +55,9 @@ def cache_folder() -> Path:
 
 @functools.cache
 def _sources_digest() -> str:
-    """The first 12 hexadecimal digits of a hash of all kernels' sources.
+    """Return the first 12 hexadecimal digits of a hash of all kernel sources.
 
-    Numba checks only the kernel's own file, and would keep stale code of functions in other files.
+    Numba checks only a kernel's own file for changes, and would keep stale code of functions in other files.
     """
     digest = hashlib.sha256()
     for source in (Path(__file__), *sorted(Path(__file__).parents[1].rglob("*_kernels.py"))):

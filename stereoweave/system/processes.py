@@ -1,4 +1,4 @@
-"""Set-up of worker processes."""
+"""Setup of worker processes."""
 
 import multiprocessing
 import os

@@ -1,4 +1,4 @@
-"""Runs tasks on the cores of one machine or many: they stream through a pool of Ray Data's workers."""
+"""Engine that runs tasks on one or many machines, as a stream through a pool of Ray Data workers."""
 
 import logging
 import math
@@ -27,23 +27,23 @@ TaskT = TypeVar("TaskT")
 ResultT = TypeVar("ResultT")
 
 _CONNECT_TIMEOUT_S, _STATUS_TIMEOUT_S = 10, 20
-# It carries only tasks and results.
+# The object store carries only tasks and results.
 _OBJECT_STORE_BYTES = 200_000_000
-# Seconds between two looks at a cluster's machines, and for a lost machine to return.
+# Seconds between two checks of a cluster's machines, and seconds that a lost machine has to return.
 _CHECKED_EVERY_S, _RETURNS_WITHIN_S = 2, 10
-# The resolution of Ray's counts of cores and GPUs.
+# Ray counts cores and GPUs at this resolution.
 _LEAST_SHARE = 0.0001
-# Consecutive workers that die while starting, before the run fails.
+# The run fails after this many consecutive workers die while starting.
 _MOST_FALSE_STARTS = 20
 _QUIET_ENVIRONMENT = {
-    # Hide deprecation warnings, and errors of Ray's C++ parts: those that matter are raised as well.
+    # Hide deprecation warnings, and errors of Ray's C++ code: errors that matter are also raised in Python.
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
     "RAY_BACKEND_LOG_LEVEL": "fatal",
-    # Keep the cluster's logs, with a line for each killed worker, off our standard output.
+    # Keep the cluster's logs, with a line for each killed worker, off standard output.
     "RAY_DEDUP_LOGS_SKIP_REGEX": ".*",
 }
-# If this is 0, the default on macOS and Windows, a Ray that is started here uses the loopback address as its
-# machine's, and listens only there. A loopback address passed to `ray.init` has no effect: Ray replaces it.
+# If this is 0, the default on macOS and Windows, a Ray instance started here uses the loopback address for
+# its machine and listens only there. A loopback address passed to `ray.init` has no effect: Ray replaces it.
 _OPEN_TO_OTHER_MACHINES = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
 _INDEX, _CONTENT = "index", "content"
 
@@ -53,12 +53,12 @@ class Engine:
     """A Ray cluster, and the number and size of the workers on it.
 
     Attributes:
-        address: The cluster's head as host:port or ray://host:port; "auto" for the Ray that runs on this
-            machine; "local" to start Ray on this machine for the duration of the work. Default: the cluster
-            in RAY_ADDRESS, or "local" if that is not set.
-        workers: The maximum number of workers. Default: as many as fit.
-        cpus_each: Cores reserved for each worker; fractions are allowed.
-        gpus_each: GPUs reserved for each worker; at 0.25 four workers share one.
+        address: The cluster's head as host:port or ray://host:port; "auto" for a Ray instance already
+            running on this machine; "local" to start Ray on this machine for the duration of the work.
+            Default: the address in RAY_ADDRESS, or "local" if that is not set.
+        workers: Maximum number of workers; default: as many as fit.
+        cpus_each: Number of cores reserved for each worker; fractions are allowed.
+        gpus_each: Number of GPUs reserved for each worker; at 0.25, four workers share a GPU.
     """
 
     address: str | None = None
@@ -76,20 +76,21 @@ class Engine:
         gpus = self.gpus_each
         if gpus and not (_LEAST_SHARE <= gpus < 1 or (1 <= gpus < math.inf and gpus % 1 == 0)):
             raise StereoweaveError(
-                f"expected 0, a part of 1 or a whole number, found {gpus}", setting="gpus_each"
+                f"expected 0, a fraction of 1 or a whole number, found {gpus}", setting="gpus_each"
             )
 
     @property
     def threads_each(self) -> int:
-        """The threads that a worker may use."""
+        """The number of threads that a worker may use."""
         return max(1, int(self.cpus_each))
 
 
 def set_environment(address: str | None) -> str | None:
-    """Set the variables that Ray reads when it is imported, except those that the user has set.
+    """Set the environment variables that Ray reads on import, except those that the user has set.
 
     Returns:
-        The address of the cluster to join; None to start Ray on this machine, listening on loopback only.
+        The address of the cluster to join; None if Ray must be started on this machine, where it will listen
+        only on the loopback address.
     """
     for name, value in _QUIET_ENVIRONMENT.items():
         os.environ.setdefault(name, value)
@@ -102,17 +103,17 @@ def set_environment(address: str | None) -> str | None:
 
 @contextmanager
 def connect(engine: Engine) -> Iterator[None]:
-    """Make this process a driver of Ray within the block, unless it already is one.
+    """Make this process a Ray driver within the block, unless it already is one.
 
     Raises:
-        StereoweaveError: If Ray is not installed, or no head answers at the address.
+        StereoweaveError: If Ray is not installed, or no Ray head answers at the address.
     """
     address = set_environment(engine.address)
     with require_extra("cluster", "this needs Ray"):
         already = "ray" in sys.modules and sys.modules["ray"].is_initialized()
         if address and not already:
-            distribution("ray")  # raises ModuleNotFoundError, without the import
-            _check_head(address)  # before the import, which reads whether to show a token
+            distribution("ray")  # raises ModuleNotFoundError without importing Ray
+            _check_head(address)  # before the import, which reads whether to send a token
         import ray
     if already:
         yield
@@ -130,16 +131,16 @@ def stream(
     """Yield the tasks' results as they arrive, in any order.
 
     If a worker or a machine dies, its tasks run again: a task may run twice, but its result is yielded once.
-    If a machine does not return, the others take over its tasks. Memory grows by less than a kilobyte per
-    task; thousands of tasks are fine.
+    If a machine does not return, the other machines take over its tasks. Memory grows by less than a kilobyte
+    per task, so thousands of tasks are fine.
 
     Args:
         make_worker: Called once in each worker's process; returns the function to call with each task.
-        tasks: Small values that can be pickled; workers load the data themselves.
+        tasks: Small values that can be pickled; workers load larger data themselves.
         engine: The cluster and its workers.
 
     Raises:
-        StereoweaveError: If a worker raised it, the cluster cannot be reached, or no worker fits on it.
+        StereoweaveError: If a worker raises one, the cluster cannot be reached, or no worker fits on it.
     """
     with connect(engine):
         waiting = dict(enumerate(tasks))
@@ -155,12 +156,12 @@ def stream(
 def call_on_each_machine(
     function: Callable[[TaskT], ResultT], argument: TaskT, engine: Engine, timeout_s: float
 ) -> list[ResultT]:
-    """Call a function once on each machine that has room for a worker, with a worker's resources.
+    """Call a function on each machine that has room for a worker, and return the results.
 
-    This process must be a driver of the cluster; see `connect`.
+    Each call reserves a worker's resources. This process must be a driver of the cluster; see `connect`.
 
     Returns:
-        The results, without those of machines that fail or do not answer in time.
+        The results, except from machines that fail or do not answer in time.
     """
     import ray
     from ray.exceptions import RayError
@@ -180,13 +181,18 @@ def call_on_each_machine(
 
 
 class _LostMachineError(Exception):
-    """Workers wait for a machine that does not return."""
+    """Error for a run whose workers wait for a machine that does not return."""
 
 
 def _run_tasks(
     make_worker: Callable[[], Callable[[TaskT], ResultT]], tasks: dict[int, TaskT], engine: Engine
 ) -> Iterator[tuple[int, ResultT]]:
-    """Yield each task's number and result until all are done; raises _LostMachineError."""
+    """Yield the number and the result of each task as it finishes.
+
+    Raises:
+        StereoweaveError: A worker raised one, or the workers failed.
+        _LostMachineError: A machine was lost and did not return.
+    """
     from ray.exceptions import RayError
 
     batches = _make_dataset(make_worker, tasks, engine).iter_batches(batch_size=None, prefetch_batches=0)
@@ -199,15 +205,15 @@ def _run_tasks(
                 yield int(index), result
     except RayError as error:
         raise StereoweaveError(
-            f"{engine.address or 'Ray'}: expected workers that begin, found {_last_line(error)}; "
-            "see that all machines have the same Stereoweave, Ray and Python"
+            f"{engine.address or 'Ray'}: the workers failed: {_last_line(error)}; "
+            "check that all machines have the same versions of Stereoweave, Ray and Python"
         ) from error
 
 
 def _make_dataset(
     make_worker: Callable[[], Callable[[TaskT], ResultT]], tasks: dict[int, TaskT], engine: Engine
 ) -> "Dataset":
-    """A lazy data set of the results: tasks run while it is read."""
+    """Return a lazy dataset of the results; the tasks run while it is read."""
     from ray.data import ActorPoolStrategy, DataContext, from_items
 
     logging.getLogger("ray.data").setLevel(logging.CRITICAL)
@@ -226,26 +232,26 @@ def _make_dataset(
 
 
 def _make_context(engine: Engine) -> "DataContext":
-    """Settings of Ray Data: no output, and a watch over the machines."""
+    """Return Ray Data's settings: no output, and a callback that watches the machines."""
     from ray.data import DataContext
 
-    with warnings.catch_warnings(action="ignore"):  # about its own default settings
+    with warnings.catch_warnings(action="ignore"):  # Ray Data warns about its own defaults
         context = DataContext.get_current().copy()
     context.enable_progress_bars = False
     context.enable_auto_log_stats = False
     context.print_on_execution_start = False
     context.max_consecutive_actor_init_deaths = _MOST_FALSE_STARTS
-    # A video, or a task of many pairs, may take longer than the half hour after which Ray Data gives up.
+    # A video, or a task of many pairs, may take longer than half an hour, after which Ray Data would give up.
     context.execution_no_progress_timeout_s = -1
-    watch: Any = partial(_Watch, engine)  # called as a class
+    watch: Any = partial(_Watch, engine)  # Ray Data calls it like a class
     context.custom_execution_callback_classes = [watch]
     return context
 
 
 class _Watch:
-    """Ray Data's callback that ends a run whose workers wait for a lost machine.
+    """Callback of Ray Data that ends a run whose workers wait for a lost machine.
 
-    Ray restarts such workers if there is room elsewhere. If there is none, their tasks would wait for ever.
+    Ray restarts such workers if there is room elsewhere. Otherwise their tasks would wait forever.
     """
 
     def __init__(self, engine: Engine) -> None:
@@ -280,7 +286,7 @@ def count_slots(engine: Engine) -> int:
     largest = max(_list_machines().values(), key=lambda resources: resources.get("CPU", 0))
     raise StereoweaveError(
         f"expected a machine with {engine.cpus_each:g} cores and {engine.gpus_each:g} GPUs for a worker, "
-        f"found {largest.get('CPU', 0):g} and {largest.get('GPU', 0):g} in the largest; join such a machine",
+        f"found {largest.get('CPU', 0):g} and {largest.get('GPU', 0):g} on the largest; add such a machine",
         remedy=Remedy("or ask for less", ("cpus_each", "gpus_each")),
     )
 
@@ -290,7 +296,7 @@ def _count_slots(engine: Engine) -> int:
 
 
 def _list_machines() -> dict[str, dict[str, float]]:
-    """Return the resources of each live machine of the cluster, by its id."""
+    """Return the resources of each live machine of the cluster, by machine ID."""
     import ray
 
     nodes: list[dict[str, Any]] = ray.nodes()  # type: ignore[no-untyped-call]
@@ -302,7 +308,7 @@ def _count_machine_slots(resources: dict[str, float], engine: Engine) -> int:
     slots = resources.get("CPU", 0) / engine.cpus_each
     if engine.gpus_each:
         slots = min(slots, resources.get("GPU", 0) / engine.gpus_each)
-    return int(slots + 1e-6)  # ten tenths make one
+    return int(slots + 1e-6)  # tolerates rounding: 0.3 / 0.1 must be 3
 
 
 def _start() -> None:
@@ -310,7 +316,7 @@ def _start() -> None:
     import ray
 
     # Ray always starts a dashboard process, which queries the metadata services of three clouds even if usage
-    # reports are off (2.60). If the port of that process is in use, Ray continues without it.
+    # reports are off (Ray 2.60). If the port of that process is in use, Ray continues without it.
     with _mute_stderr(), socket.create_server(("127.0.0.1", 0)) as occupied:
         ray.init(
             address="local",
@@ -330,21 +336,22 @@ def _join(address: str) -> None:
     try:
         with _mute_stderr():
             ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
-    except Exception as error:  # Ray's own, gRPC's and Python's, which have no common base class
+    except Exception as error:  # errors of Ray, gRPC and Python have no common base class
         raise _make_join_error(address, _first_line(error)) from error
 
 
 def _make_join_error(address: str, found: str) -> StereoweaveError:
     return StereoweaveError(
         f"{address}: expected the head of a Ray cluster, found {found}; "
-        "see that Ray and Python are of the cluster's versions, and that its token is here"
+        "check that Ray and Python have the cluster's versions, and that this machine has its token"
     )
 
 
 def _check_head(address: str) -> None:
-    """Raise an error if no head answers: `ray.init` would retry for minutes, and then exit the process.
+    """Raise an error if no Ray head answers.
 
-    At a port of Ray's client (ray://) it gives up after half a minute, and raises an error itself.
+    Otherwise `ray.init` would retry for minutes, then end the process. For Ray Client (ray://) only the port
+    is checked: `ray.init` then gives up after half a minute, and raises an error itself.
     """
     try:
         if address != "auto":
@@ -352,31 +359,31 @@ def _check_head(address: str) -> None:
         if not address.startswith("ray://"):
             _check_status(address)
     except (OSError, subprocess.TimeoutExpired) as error:
-        found = _first_line(error) if isinstance(error, OSError) else "something else that listens there"
+        found = _first_line(error) if isinstance(error, OSError) else f"no reply in {_STATUS_TIMEOUT_S} s"
         raise StereoweaveError(
-            f"{address}: expected the head of a Ray cluster that answers, found {found}; "
-            "is it started, and does a firewall let this machine through?"
+            f"{address}: expected the head of a Ray cluster, found {found}; "
+            "is it running, and does the firewall let this machine through?"
         ) from error
 
 
 def _check_port(address: str) -> None:
-    """Raise an error if the address is malformed, an OSError if nothing listens at it."""
+    """Raise a StereoweaveError if the address is malformed, or an OSError if nothing listens at it."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if not (host and port.isdigit() and 0 < int(port) < 65536):
         raise StereoweaveError(
-            f"a cluster's address: expected host:port, ray://host:port, auto or local, found {address!r}"
+            f"cluster address: expected host:port, ray://host:port, auto or local, found {address!r}"
         )
     socket.create_connection((host, int(port)), _CONNECT_TIMEOUT_S).close()
 
 
 def _check_status(address: str) -> None:
-    """Raise an error if `ray status` fails; have Ray show its token if the head requires one.
+    """Raise an error if `ray status` fails; make Ray send its token if the head requires one.
 
-    Ray shows none by default, and if it shows one to a head that requires none, actors end at once (2.60).
+    By default, Ray sends none. If it sends one to a head that requires none, actors end at once (Ray 2.60).
 
     Raises:
-        StereoweaveError: The head refused: wrong version, wrong token.
-        subprocess.TimeoutExpired: Nothing that understands Ray answers.
+        StereoweaveError: The head refused the version or the token.
+        subprocess.TimeoutExpired: No Ray head replied in time.
     """
     status = _run_status_command(address)
     if "AuthenticationError" in status.stderr and "RAY_AUTH_MODE" not in os.environ:
@@ -388,15 +395,15 @@ def _check_status(address: str) -> None:
 
 
 def _run_status_command(address: str) -> subprocess.CompletedProcess[str]:
-    """The outcome of the command `ray status`, in a process of its own."""
-    # -P: else a file in the current folder may have the name of a library.
+    """Run `ray status` in a separate process, and return its outcome."""
+    # -P: otherwise a file in the current folder could shadow a library.
     command = [sys.executable, "-P", "-m", "ray.scripts.scripts", "status", "--address", address]
     return subprocess.run(command, capture_output=True, text=True, timeout=_STATUS_TIMEOUT_S, check=False)
 
 
 @contextmanager
 def _mute_stderr() -> Iterator[None]:
-    """Discard what Ray writes to the standard error: a line of C++ that it has read RAY_BACKEND_LOG_LEVEL."""
+    """Discard standard error within the block: Ray's C++ code prints a line about RAY_BACKEND_LOG_LEVEL."""
     sys.stderr.flush()
     kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 2)
@@ -414,12 +421,12 @@ def _first_line(error: Exception) -> str:
 
 
 def _last_line(error: Exception) -> str:
-    """The last line of an error of Ray, which names the cause."""
+    """Return the last line of a Ray error, which names the cause."""
     return str(error).strip().splitlines()[-1].rstrip(".;")
 
 
 class _TaskRunner:
-    """Callable of a worker's process for Ray Data: made once, called with a row for each task."""
+    """Callable that Ray Data creates once in each worker process, and calls once for each task."""
 
     def __init__(self, make_worker: Callable[[], Callable[[Any], Any]], threads: int) -> None:
         import cv2
@@ -432,7 +439,10 @@ class _TaskRunner:
         return {_INDEX: batch[_INDEX], _CONTENT: [self._run_task(content) for content in batch[_CONTENT]]}
 
     def _run_task(self, content: bytes) -> bytes:
-        """A task's pickled result, or its error for the driver to raise: Ray's own report has many lines."""
+        """Run a task, and return its pickled result, or its pickled error for the driver to raise.
+
+        Ray's own report of an error would have many lines.
+        """
         try:
             if self._worker is None:
                 self._worker = self._make_worker()

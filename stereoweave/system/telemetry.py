@@ -1,9 +1,9 @@
-"""Turns off the usage reports of libraries."""
+"""Switch that turns off the usage reports of libraries."""
 
 import os
 
-# Each library reads its variable when it is imported or soon after. onnxruntime.disable_telemetry_events()
-# does not replace it: ONNX Runtime 1.31 sends reports even after that call.
+# Each library reads its variable when it is imported or soon after. Calling
+# onnxruntime.disable_telemetry_events() is not enough: ONNX Runtime 1.31 sends reports even after that call.
 _SWITCHES = {
     "ORT_DISABLE_TELEMETRY": "1",
     "GRADIO_ANALYTICS_ENABLED": "False",

@@ -1,4 +1,4 @@
-"""Numbers of threads, and work on bands of rows in threads."""
+"""Number of threads, and work on bands of image rows in several threads."""
 
 import os
 from collections.abc import Callable
@@ -11,25 +11,29 @@ _MOST_THREADS = 1024
 
 
 def thread_count(threads: int | None) -> int:
-    """The requested number of threads, default: all cores; raises StereoweaveError if it is out of range."""
+    """Return the number of threads to use: as requested, or by default one per usable core.
+
+    Raises:
+        StereoweaveError: The requested number is out of range.
+    """
     if threads is not None:
         check_whole_number("threads", threads)
         if not 1 <= threads <= _MOST_THREADS:
             raise StereoweaveError(
-                f"expected 1 or more, got {threads}; {_MOST_THREADS} at most", setting="threads"
+                f"expected a number from 1 to {_MOST_THREADS}, got {threads}", setting="threads"
             )
     return threads or usable_cores()
 
 
 def usable_cores() -> int:
-    """The number of cores that this process may use, at most those of the machine."""
+    """Return the number of cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def in_bands(work: Callable[[int, int], None], height: int, count: int, threads: int) -> None:
-    """Call `work(first_row, end_row)` for each of `count` bands of rows, in threads."""
+    """Call `work(first_row, end_row)` for each of `count` bands of rows, in several threads."""
     ends = [height * band // count for band in range(count + 1)]
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(work, ends[:-1], ends[1:]))

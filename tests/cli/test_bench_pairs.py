@@ -87,7 +87,7 @@ def test_every_matcher_has_every_number_and_both_plots_are_drawn(sets, tmp_path,
         ("--sparsification words", ["words: expected a picture file ending"]),
         ("--dataset words", ["dataset: expected one of", "'words'"]),
         ("--dataset kitti2015", ["expected a folder of the dataset"]),
-        ("--cluster 127.0.0.1:1", ["127.0.0.1:1: expected the head of a Ray cluster that answers"]),
+        ("--cluster 127.0.0.1:1", ["127.0.0.1:1: expected the head of a Ray cluster"]),
     ],
 )
 def test_a_mistake_is_told_in_one_line_before_anything_is_measured(

@@ -150,7 +150,7 @@ def test_a_cluster_that_does_not_answer_is_told_in_one_line(tmp_path, capsys):
     assert run(line) == 2
     told = capsys.readouterr()
     assert told.out == ""
-    assert "127.0.0.1:1: expected the head of a Ray cluster that answers, found " in told.err
+    assert "127.0.0.1:1: expected the head of a Ray cluster, found " in told.err
     assert told.err.endswith("; all finished pairs are complete: rerun the same command to resume\n")
     assert told.err.count("\n") == 1
 

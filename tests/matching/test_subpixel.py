@@ -132,7 +132,7 @@ def test_a_steep_slant_is_no_edge(texture):
 
 def test_no_threads_are_refused(texture):
     left, right = pair_with(ramp_px(), texture)
-    with pytest.raises(ValueError, match="threads: expected 1 or more, got 0"):
+    with pytest.raises(ValueError, match="threads: expected a number from 1 to 1024, got 0"):
         to_subpixel(left, right, estimate_of(ramp_px()), threads=0)
 
 

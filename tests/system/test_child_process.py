@@ -38,7 +38,7 @@ def waiting(tmp_path):
     child.close()
 
 
-def test_a_function_gives_its_result_or_its_error_from_another_process(tmp_path):
+def test_a_function_in_another_process_returns_its_result_or_raises_its_error(tmp_path):
     child = child_of(os.path.getsize, tmp_path / "files")
     (tmp_path / "seven").write_bytes(bytes(7))
     assert child(tmp_path / "seven", timeout_s=10) == 7
@@ -48,7 +48,7 @@ def test_a_function_gives_its_result_or_its_error_from_another_process(tmp_path)
     child.close()
 
 
-def test_a_call_that_takes_too_long_ends_its_process_and_the_next_one_is_answered(waiting):
+def test_a_call_that_takes_too_long_ends_its_process_and_the_next_call_succeeds(waiting):
     assert waiting(0, timeout_s=10) is None
     first, start_s = waiting.pid, time.monotonic()
     with pytest.raises(TimeoutError):
@@ -58,12 +58,12 @@ def test_a_call_that_takes_too_long_ends_its_process_and_the_next_one_is_answere
     assert waiting(0, timeout_s=10) is None
 
 
-def test_a_crash_is_one_line_and_the_next_call_is_answered(tmp_path):
+def test_a_crash_is_reported_in_one_line_and_the_next_call_succeeds(tmp_path):
     child = child_of(signal.raise_signal, tmp_path / "files")
-    with pytest.raises(ProcessDiedError, match=r"found that it ended \(SIGSEGV\); ") as crash:
+    with pytest.raises(ProcessDiedError, match=r"ended early \(SIGSEGV\): ") as crash:
         child(signal.SIGSEGV, timeout_s=10)
     assert "\n" not in str(crash.value)
-    assert child(0, timeout_s=10) is None  # signal 0 is none
+    assert child(0, timeout_s=10) is None  # signal 0 has no effect
     child.close()
 
 
@@ -78,7 +78,7 @@ def test_a_process_that_is_still_starting_is_not_replaced(tmp_path):
     child.close()
 
 
-def test_a_call_that_is_late_already_is_not_begun(waiting):
+def test_a_call_with_no_time_left_is_not_started(waiting):
     assert waiting(0, timeout_s=10) is None
     pid = waiting.pid
     with pytest.raises(TimeoutError):
@@ -95,7 +95,7 @@ def test_temporary_files_of_a_killed_process_are_removed(tmp_path):
     assert not (tmp_path / "files").exists()
 
 
-def test_a_function_that_cannot_be_made_says_so_at_each_call(tmp_path):
+def test_an_error_in_making_the_function_is_raised_at_each_call(tmp_path):
     child = ChildProcess(partial(open, tmp_path / "none"), tmp_path / "files")
     for _ in range(2):
         with pytest.raises(FileNotFoundError):
@@ -103,7 +103,7 @@ def test_a_function_that_cannot_be_made_says_so_at_each_call(tmp_path):
     child.close()
 
 
-def test_what_a_function_prints_is_no_part_of_its_result(tmp_path):
+def test_the_output_of_a_function_is_not_part_of_its_result(tmp_path):
     child = child_of(partial(os.write, 1), tmp_path / "files")
     assert child(b"printed\n", timeout_s=10) == 8
     child.close()
@@ -123,19 +123,19 @@ def test_a_busy_process_ends_with_its_parent(tmp_path):
     wait_for_end(pid)
 
 
-def test_a_file_of_the_current_folder_is_not_taken_for_a_module(tmp_path, monkeypatch):
+def test_a_file_in_the_current_folder_does_not_shadow_a_module(tmp_path, monkeypatch):
     (tmp_path / "textwrap.py").write_text(
         f"from pathlib import Path\nPath({str(tmp_path)!r}, 'run').touch()\n"
     )
     monkeypatch.chdir(tmp_path)
     child = child_of(abs, tmp_path / "files")
-    with suppress(ProcessDiedError):  # where that file was run, it lacks what is imported from the real one
+    with suppress(ProcessDiedError):  # if that file is imported, it lacks the names of the real module
         child(-7, timeout_s=10)
     child.close()
     assert not (tmp_path / "run").exists()
 
 
-def test_the_temporary_folder_is_made_again_where_it_was_removed(tmp_path):
+def test_a_removed_temporary_folder_is_made_again(tmp_path):
     child = child_of(partial(subprocess.run, shell=True, check=True), tmp_path / "own" / "files")
     child("touch $TMPDIR/first", timeout_s=10)
     shutil.rmtree(tmp_path / "own")
@@ -146,7 +146,7 @@ def test_the_temporary_folder_is_made_again_where_it_was_removed(tmp_path):
     child.close()
 
 
-def test_a_process_that_could_not_be_started_again_is_started_at_a_later_call(tmp_path):
+def test_a_process_that_could_not_be_restarted_is_started_by_a_later_call(tmp_path):
     child, folder = (
         child_of(partial(subprocess.run, shell=True, check=True), tmp_path / "files"),
         tmp_path / "files",

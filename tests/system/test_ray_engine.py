@@ -1,4 +1,4 @@
-"""The engine on a real Ray: what comes back, what a dead worker costs, what is said of a wrong address."""
+"""The engine on a real Ray: results, killed workers, errors, and wrong addresses."""
 
 import importlib
 import os
@@ -36,7 +36,7 @@ def make_reporter():
 
 
 def make_mortal(folder: Path):
-    """A worker that is killed by each task whose number divides by 5, the first time that it comes."""
+    """Return a worker that is killed by the first attempt at each task whose number is divisible by 5."""
 
     def work(task: int) -> int:
         (folder / f"{task} by {os.getpid()}").touch()
@@ -64,7 +64,7 @@ def make_failing(error: Exception):
     return work
 
 
-def test_each_task_comes_back_once_from_workers_that_are_made_once_and_keep_to_their_core(engine):
+def test_each_task_gives_one_result_from_workers_that_are_made_once_and_use_one_core(engine):
     results = list(stream(make_reporter, range(40), engine))
     assert sorted(result[0] for result in results) == list(range(40))
     assert {result[1:3] for result in results} == {(pid, pid) for _, pid, *_ in results}
@@ -73,7 +73,7 @@ def test_each_task_comes_back_once_from_workers_that_are_made_once_and_keep_to_t
     assert list(stream(make_reporter, [], engine)) == []
 
 
-def test_the_tasks_of_a_killed_worker_are_done_again_by_its_successor(engine, tmp_path):
+def test_the_tasks_of_a_killed_worker_are_repeated_by_its_successor(engine, tmp_path):
     results = sorted(stream(partial(make_mortal, tmp_path), range(12), engine))
     assert results == sorted(-task for task in range(12))
     assert len(list(tmp_path.glob("10 by *"))) == 2
@@ -85,26 +85,26 @@ def test_a_task_may_take_longer_than_ray_data_waits_for_progress(engine, monkeyp
     assert list(stream(partial(make_slow, 3), [1], engine)) == [1]
 
 
-def test_what_a_worker_raises_is_raised_here_as_it_was(engine):
-    with pytest.raises(FormatError, match=r"^that is none$"):
-        list(stream(partial(make_failing, FormatError("that is none")), range(8), engine))
+def test_a_workers_error_is_raised_unchanged_in_the_driver(engine):
+    with pytest.raises(FormatError, match=r"^invalid file$"):
+        list(stream(partial(make_failing, FormatError("invalid file")), range(8), engine))
     with pytest.raises(KeyError) as caught:
         list(stream(partial(make_failing, KeyError("mistake")), range(8), engine))
     assert "in work" in caught.value.__notes__[0]
 
 
-def test_workers_that_lack_a_module_are_reported_in_a_line(engine, tmp_path, monkeypatch, capfd):
+def test_workers_that_lack_a_module_are_reported_in_one_line(engine, tmp_path, monkeypatch, capfd):
     (tmp_path / "only_here.py").write_text("def make():\n    return str\n")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(engine_module, "_MOST_FALSE_STARTS", 0)
     make = importlib.import_module("only_here").make
-    with pytest.raises(StereoweaveError, match="begin, found .*No module named 'only_here'; see") as caught:
+    with pytest.raises(StereoweaveError, match="workers failed: .*No module named 'only_here'; ") as caught:
         list(stream(make, [1], engine))
     assert "\n" not in str(caught.value)
     assert capfd.readouterr().out == ""
 
 
-def test_a_killed_worker_is_no_line_on_the_output(ray_address, tmp_path):
+def test_a_killed_worker_causes_no_output(ray_address, tmp_path):
     program = """
 import os, sys, time
 from pathlib import Path
@@ -132,7 +132,7 @@ time.sleep(3)  # until Ray has reported
     assert done.stderr == ""
 
 
-def test_a_worker_that_fits_no_machine_is_refused_and_parts_of_a_core_are_counted(engine):
+def test_a_worker_too_large_for_every_machine_is_refused_and_fractions_of_cores_are_counted(engine):
     assert count_slots(engine) == 2
     assert count_slots(Engine(cpus_each=0.1)) == 20
     with pytest.raises(StereoweaveError, match=r"a machine with 3 cores and 0 GPUs .* found 2 and 0"):
@@ -157,7 +157,7 @@ def name_of_positive(task: int) -> str:
     return f"{task} in {os.getpid()}"
 
 
-def test_a_function_is_called_on_each_machine_that_has_room_and_an_error_is_no_result(engine):
+def test_a_function_is_called_on_each_machine_with_room_and_errors_are_left_out(engine):
     (result,) = call_on_each_machine(name_of_positive, 7, Engine(), timeout_s=60)
     assert result.startswith("7 in ")
     assert result != name_of_positive(7)
@@ -167,13 +167,13 @@ def test_a_function_is_called_on_each_machine_that_has_room_and_an_error_is_no_r
 
 
 def test_a_wrong_address_is_reported_in_one_line(engine, monkeypatch):
-    ray.shutdown()  # where there is a connection already, the address is not asked for
+    ray.shutdown()  # with an existing connection, the address would not be used
     monkeypatch.setattr(engine_module, "_STATUS_TIMEOUT_S", 1)
     with socket.create_server(("127.0.0.1", 0)) as deaf:
         addresses = {
-            "127.0.0.1:1": "expected the head of a Ray cluster that answers, found .*refused",
-            "ray://127.0.0.1:1": "expected the head of a Ray cluster that answers, found .*refused",
-            f"127.0.0.1:{deaf.getsockname()[1]}": "found something else that listens there",
+            "127.0.0.1:1": "^127.0.0.1:1: expected the head of a Ray cluster, found .*refused",
+            "ray://127.0.0.1:1": "expected the head of a Ray cluster, found .*refused",
+            f"127.0.0.1:{deaf.getsockname()[1]}": "expected the head of a Ray cluster, found no reply in 1 s",
             "nonsense": "expected host:port, ray://host:port, auto or local, found 'nonsense'",
         }
         for address, expected in addresses.items():
@@ -182,7 +182,7 @@ def test_a_wrong_address_is_reported_in_one_line(engine, monkeypatch):
             assert "\n" not in str(caught.value)
 
 
-def test_the_token_is_shown_to_a_head_that_requires_it_and_a_wrong_one_is_reported_in_one_line(
+def test_the_token_is_sent_to_a_head_that_requires_it_and_a_wrong_token_is_reported_in_one_line(
     guarded_ray_address,
 ):
     program = """

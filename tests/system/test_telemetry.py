@@ -1,4 +1,4 @@
-"""What libraries would report to their makers is turned off before any of them is imported."""
+"""The usage reports of libraries are turned off before any of the libraries is imported."""
 
 import json
 import os
@@ -9,7 +9,7 @@ OFF = {"ORT_DISABLE_TELEMETRY": "1", "GRADIO_ANALYTICS_ENABLED": "False", "RAY_U
 
 
 def variables_after(program: str, **chosen: str) -> dict[str, str]:
-    """The three variables after a program, in an environment where the user has chosen these alone."""
+    """Run a program with only the chosen variables set, and return the three variables at its end."""
     others = {name: value for name, value in os.environ.items() if name not in OFF}
     program += f"; import json, os; print(json.dumps([os.environ.get(name) for name in {list(OFF)}]))"
     done = subprocess.run(
@@ -22,7 +22,7 @@ def test_importing_a_module_of_the_package_turns_off_all_reports():
     assert variables_after("import stereoweave.system.threads") == OFF
 
 
-def test_what_the_user_has_set_is_kept():
+def test_variables_that_the_user_has_set_are_kept():
     chosen = {
         "ORT_DISABLE_TELEMETRY": "0",
         "GRADIO_ANALYTICS_ENABLED": "True",

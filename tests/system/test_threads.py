@@ -6,7 +6,7 @@ from stereoweave.errors import StereoweaveError
 from stereoweave.system.threads import thread_count, usable_cores
 
 
-def test_the_number_asked_for_counts_and_without_one_the_usable_cores():
+def test_the_default_number_of_threads_is_the_number_of_usable_cores():
     assert thread_count(3) == 3
     assert thread_count(None) == usable_cores()
     assert 1 <= usable_cores() <= (os.cpu_count() or 1)
@@ -14,5 +14,5 @@ def test_the_number_asked_for_counts_and_without_one_the_usable_cores():
 
 @pytest.mark.parametrize("threads", [0, -2])
 def test_less_than_one_thread_is_refused(threads):
-    with pytest.raises(StereoweaveError, match=f"threads: expected 1 or more, got {threads}"):
+    with pytest.raises(StereoweaveError, match=f"threads: expected a number from 1 to 1024, got {threads}"):
         thread_count(threads)
