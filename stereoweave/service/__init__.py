@@ -1,13 +1,13 @@
 """The HTTP service.
 
-`stereoweave.service:application` is what a Serve config file names.
+A Serve config file refers to the application as `stereoweave.service:application`.
 """
 
 from typing import Any
 
 
 def __getattr__(name: str) -> Any:
-    """The public names, imported when they are first asked for: they need Ray."""
+    """Import a public name on first use, because importing it needs Ray."""
     if name not in ("Settings", "application"):
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from stereoweave.service import deployment

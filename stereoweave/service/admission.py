@@ -9,15 +9,15 @@ from statistics import median
 from stereoweave.errors import StereoweaveError
 from stereoweave.service.answers import ServiceJob, TooLargeError
 
-# Factors of time per pixel for large pictures, and for full resolution. Checks and rectification take a
-# fraction of a second at any size.
+# Factors by which large pictures and refinement increase the time per pixel. Checks and rectification are not
+# counted, because they take a fraction of a second at any size.
 _LARGE_FROM_MEGAPIXELS, _LARGE, _REFINED = 2, 2.5, 1.3
-# The number of recent speeds; one or two outliers do not change their median.
+# Number of recent speeds to keep, enough that one or two outliers hardly change their median.
 _LATEST = 9
 
 
 class BusyError(StereoweaveError):
-    """A request that would be late only because of those accepted before it."""
+    """Error for a request that would be late only because of requests accepted before it."""
 
     def __init__(self, message: str, retry_after_s: int = 1) -> None:
         super().__init__(message)
@@ -25,10 +25,10 @@ class BusyError(StereoweaveError):
 
 
 class Budget:
-    """The accepted work of one process, and its time per unit of `estimate_work`.
+    """Accepted work of one process, and the time that the process takes per unit of `estimate_work`.
 
-    A request is refused permanently if it could not finish in time at the best speed so far. It is refused
-    temporarily if it would be late after the accepted ones at the usual speed, the median of the last few.
+    A request is refused for good if it could not finish in time even at the best speed so far. It is refused
+    for now if it would be late, after all accepted requests, at the usual speed: the median of recent speeds.
     """
 
     def __init__(self, seconds_each: float) -> None:
@@ -38,23 +38,23 @@ class Budget:
 
     @contextmanager
     def admit(self, job: ServiceJob, megapixels: float, left_s: float) -> Iterator[None]:
-        """Count the job as accepted within the block.
+        """Accept a job, and count its work until the end of the block.
 
         Raises:
             TooLargeError: If the job alone takes longer than `left_s`.
-            BusyError: If it takes longer than that after the accepted ones.
+            BusyError: If the job and those accepted before it together take longer than `left_s`.
         """
         work = estimate_work(job, megapixels)
         least_s = work * self._best_each_s
         if least_s > left_s:
             raise TooLargeError(
-                f"expected a request that takes at most {left_s:.0f} s, found {megapixels:.1f} megapixels, "
-                f"which take {least_s:.0f} s with its options; send smaller pictures, or fewer options"
+                f"expected a request that takes at most {left_s:.0f} s, found {megapixels:.1f} megapixels "
+                f"that take {least_s:.0f} s with these options; send smaller pictures or use fewer options"
             )
         late_s = (sum(self._accepted) + work) * median(self._latest_each_s) - left_s
         if self._accepted and late_s > 0:
             raise BusyError(
-                f"expected at most {left_s:.0f} s of work, found {late_s:.0f} s more; try again later",
+                f"pending requests would make this one {late_s:.0f} s late; try again later",
                 retry_after_s=math.ceil(late_s),
             )
         self._accepted.append(work)
@@ -64,17 +64,17 @@ class Budget:
             self._accepted.remove(work)
 
     def learn(self, work: float, took_s: float, *, finished: bool = True) -> None:
-        """Update the speeds with the time that work took, or after which it was stopped unfinished."""
+        """Update the speeds with the time that work took until it was finished or stopped."""
         each_s = took_s / work
         if finished:
             self._best_each_s = min(self._best_each_s, each_s)
-        else:  # it would have taken longer
+        else:  # the whole work would have taken longer
             each_s = max(each_s, median(self._latest_each_s))
         self._latest_each_s.append(each_s)
 
 
 def estimate_work(job: ServiceJob, megapixels: float) -> float:
-    """The work of a job, in megapixels of unrefined disparity of small pictures that take as long."""
+    """Return the work of a job; one unit is a megapixel of small pictures, matched without refinement."""
     large = _LARGE if megapixels > _LARGE_FROM_MEGAPIXELS else 1
     refined = _REFINED if job.match_options.refined else 1
     return megapixels * large * refined

@@ -45,12 +45,12 @@ _FIELDS = {
     "refined": "refined",
     "strength": "strength",
 }
-# Notes may quote their picture, and are sent in a response header.
+# Notes may quote text from a picture, and they are sent in a response header.
 _LONGEST_NOTE = 300
 
 
 class TooLargeError(StereoweaveError):
-    """A request larger than the service accepts."""
+    """Error for a request that is larger than the service accepts."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,13 +60,14 @@ class ServiceJob:
     Attributes:
         folder: Folder of this request's files.
         pictures: Two pictures, left first, or one that holds both views.
-        file: File to return: a disparity or depth map of `results.FILES`, or a view, such as view.png.
+        file: Name of the file to return: a disparity or depth map of `results.FILES`, or a view, such as
+            view.png.
         request: Layout, camera and rectification of the pictures.
         options: Matching options; see `match_options`.
         position: Position of a view.
         strength: Factor on the baseline, as for `rendering.Renderer`.
-        checked: Whether to check the pair and add notes on problems; takes 1.5 times as long.
-        most_megapixels: Greatest size of a view.
+        checked: Whether to check the pair and add notes on problems; the job then takes 1.5 times as long.
+        most_megapixels: Maximum size of a view.
     """
 
     folder: Path
@@ -106,11 +107,11 @@ BatchAnswerer = Callable[[Sequence[ServiceJob]], list[ServiceAnswer | Exception]
 
 
 def check_pixels(job: ServiceJob) -> float:
-    """Return the megapixels to match, from the pictures' headers, before any is decoded.
+    """Return the number of megapixels to match, read from the pictures' headers without decoding.
 
     Raises:
         TooLargeError: A view is larger than the job allows.
-        FormatError: A file is not a picture, or of an unsupported kind.
+        FormatError: A file is not a picture of a supported format.
     """
     views, megapixels = 3 - len(job.pictures), 0.0
     for path in job.pictures:
@@ -132,12 +133,12 @@ def _check_megapixels(path: Path, size_px: tuple[int, ...], most_megapixels: flo
 
 
 def load_measurer() -> Callable[[ServiceJob], float]:
-    """Return the function that measures a job's pictures, for a `ChildProcess`."""
+    """Return the function with which a `ChildProcess` measures a job's pictures."""
     return check_pixels
 
 
 def load_answerer(backend: Backend) -> BatchAnswerer:
-    """Load the network and return the function that answers jobs with it, for a `ChildProcess`."""
+    """Load the network, and return the function with which a `ChildProcess` answers jobs."""
     return partial(answer_many, backend.matcher())
 
 
@@ -165,21 +166,21 @@ def field_name(setting: str) -> str | None:
 def strip_paths(line: str, folder: Path) -> str:
     """Remove this machine's paths and line breaks from a message."""
     text = line.replace(f"{folder}/", "")
-    text = re.sub(r"(?<![^\s'\"(])/(?:[^\s/]+/)+", "", text)  # path of a network
+    text = re.sub(r"(?<![^\s'\"(])/(?:[^\s/]+/)+", "", text)  # the path of a model file
     return " ".join(text.split())
 
 
 def _attempt(work: Callable[..., Any], *given: Any, **options: Any) -> Any:
-    """Return the result of the work, or its error."""
+    """Call a function, and return its result or the error that it raises."""
     try:
         return work(*given, **options)
-    except Exception as error:  # any error: it must not reach the other jobs of the batch
+    except Exception as error:  # no error may affect the other jobs of the batch
         return error
 
 
 def _prepare(job: ServiceJob) -> Prepared:
     prepared = prepare(job.pictures, job.request)
-    # Checked again, because detected half-size views grow beyond what the picture's header states.
+    # Check again, because views detected as half-size are enlarged beyond the size in the picture's header.
     _check_megapixels(job.pictures[0], prepared.pair.left.shape[1::-1], job.most_megapixels)
     if needs_camera(job.file):
         require_camera(prepared.pair)
@@ -189,21 +190,21 @@ def _prepare(job: ServiceJob) -> Prepared:
 def _match_together(
     matcher: Matcher, options: MatchOptions, prepared: Sequence[Prepared]
 ) -> Sequence[Result | Exception]:
-    """Match pairs together; return the result or error of each."""
+    """Match pairs together, and return the result or error of each."""
     results = _attempt(run_many, prepared, matcher, options)
     if not isinstance(results, Exception):
         return results
     if len(prepared) == 1:
         return [results]
-    # One by one, so that one pair's error does not affect the others.
+    # Match them one by one, so that one pair's error does not affect the others.
     return [found for each in prepared for found in _match_together(matcher, options, [each])]
 
 
 def _answer(matcher: Matcher, job: ServiceJob, result: Result) -> ServiceAnswer:
-    # The network's own name, because it may have been loaded from a path of this machine.
+    # Report the network's own name, because the model may be a path on this machine.
     summary = replace(result.summary, model=matcher.name)
     notes = [*result.notes, *(result.warnings() if job.checked else ())]
-    # Not beside its pictures: their folder is removed if the client disconnects, and would be created again.
+    # Do not write to the pictures' folder: it is removed if the client disconnects, and would be made again.
     with TemporaryDirectory(prefix="stereoweave-") as folder:
         path = Path(folder, job.file)
         if job.is_view:
@@ -220,8 +221,8 @@ def _write_map(path: Path, result: Result) -> None:
     except RangeError as error:
         summary = result.summary
         raise StereoweaveError(
-            f"{path.name}: expected 0 to 255.99 px, which a PNG holds, found "
-            f"{summary.disparity_min_px:.2f} to {summary.disparity_max_px:.2f} px; ask for pfm, npy or tiff"
+            f"{path.name}: expected disparities of 0 to 255.99 px, the range of a PNG, found "
+            f"{summary.disparity_min_px:.2f} to {summary.disparity_max_px:.2f} px; request pfm, npy or tiff"
         ) from error
 
 

@@ -1,4 +1,4 @@
-"""HTTP interface of the service: its paths, its responses, and a guard that limits requests."""
+"""HTTP interface of the service: paths, responses, and a guard that limits requests."""
 
 import asyncio
 import secrets
@@ -32,7 +32,7 @@ from stereoweave.service.answers import (
 from stereoweave.service.forms import MapForm, PairForm, ViewForm, store_uploads
 from stereoweave.system.child_process import ProcessDiedError
 
-# Some pending requests are done by then.
+# Some pending requests will have finished by then.
 _RETRY_AFTER_S = 1
 _LATENCIES_S = [0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 60]
 _PATHS = ("/disparity", "/depth", "/view")
@@ -45,7 +45,7 @@ has statistics and notes in JSON; every error is `{"detail": "..."}`."""
 
 
 class Refusal(BaseModel):
-    """An error response: expected, found and remedy in one line."""
+    """An error response: one line that says what was expected, what was found, and the remedy."""
 
     detail: str
 
@@ -59,8 +59,8 @@ _REFUSALS: dict[int | str, dict[str, Any]] = {
         413: "More bytes or pixels than accepted, or more work than the time limit allows.",
         415: "Content type other than multipart/form-data.",
         422: "Unknown, missing or invalid field.",
-        503: "Busy: retry after the seconds in the header Retry-After. Or disk, memory, provider or worker "
-        "process failed.",
+        503: "Busy: retry after the number of seconds in the header Retry-After. Or a failure of the disk, "
+        "the memory, the provider or a worker process.",
         504: "No response within the time limit.",
     }.items()
 }
@@ -71,7 +71,7 @@ _Send = Callable[[_Message], Awaitable[None]]
 _Server = Callable[[_Message, _Receive, _Send], Coroutine[Any, Any, None]]
 # Errors whose message is sent to the client. TimeoutError is an OSError.
 FAILURES = (StereoweaveError, OSError, MemoryError)
-# Answers a job within the given seconds.
+# Answers a job within the given number of seconds.
 JobAnswerer = Callable[[ServiceJob, float], Awaitable[ServiceAnswer]]
 
 
@@ -79,12 +79,12 @@ class Limits(BaseModel):
     """Limits of a replica.
 
     Attributes:
-        megabytes: Greatest size of a whole request.
-        megapixels: Greatest size of a view.
-        timeout_s: Time from the header of a request to that of its response.
-        waiting: Greatest number of pending requests; more are refused.
+        megabytes: Maximum size of a whole request.
+        megapixels: Maximum size of a view.
+        timeout_s: Maximum time from the header of a request to the header of its response.
+        waiting: Maximum number of pending requests; further ones are refused.
         hosts: Allowed values of the header Host; None allows any.
-        token: Bearer token that every request except /health must send; None requires none.
+        token: Bearer token that every request except /health must send; None if no token is required.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -104,19 +104,19 @@ _ViewForm = Annotated[ViewForm, Form(media_type="multipart/form-data")]
 def make_app(
     answer_job: JobAnswerer, limits: Limits, folder: Path, registry: CollectorRegistry | None = None
 ) -> FastAPI:
-    """Make the application.
+    """Make the ASGI application of the service.
 
     Args:
-        answer_job: Answers a job.
-        limits: What it accepts.
-        folder: Holds uploads until they are processed.
-        registry: Metrics to serve at /metrics; None for no such path.
+        answer_job: Function that answers a job within a number of seconds.
+        limits: Limits on requests.
+        folder: Folder that holds uploads until they are processed.
+        registry: Metrics to serve at /metrics; if None, there is no such path.
     """
     app = FastAPI(
         title="Stereoweave",
         version=__version__,
         description=_DESCRIPTION,
-        # These pages load scripts from other hosts.
+        # These pages would load scripts from other hosts.
         docs_url=None,
         redoc_url=None,
     )
@@ -177,7 +177,7 @@ def _join_errors(error: RequestValidationError) -> str:
 
 @dataclass(frozen=True)
 class _Responder:
-    """Makes responses to forms; each form's files are in a folder of its own until then."""
+    """Callable that responds to a form, whose files are in a separate folder until the response is ready."""
 
     answer_job: JobAnswerer
     most_megapixels: float
@@ -193,11 +193,11 @@ class _Responder:
         return _make_response(answer, file)
 
     def _make_folder(self) -> TemporaryDirectory[str]:
-        """Make a folder for one request."""
+        """Make a temporary folder for one request."""
         try:
-            # Cleaners of /tmp remove folders that were not used for days.
+            # Cleaners of /tmp remove folders that have not been used for days.
             self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            # After a request was cancelled, a process may still use the folder.
+            # A process may still use the folder after the request is cancelled.
             return TemporaryDirectory(dir=self.folder, ignore_cleanup_errors=True)
         except OSError as error:
             raise _make_http_exception(error, self.folder) from error
@@ -236,7 +236,7 @@ def _find_status(error: Exception) -> int:
 
 
 class _Metrics:
-    """Metrics of the requests, in a registry."""
+    """Request metrics in a Prometheus registry."""
 
     def __init__(self, registry: CollectorRegistry) -> None:
         self.requests = Counter(
@@ -252,9 +252,9 @@ class _Metrics:
 
 
 class Guard:
-    """Middleware that limits POST requests (number, size, type, token, time).
+    """Middleware that checks tokens, and limits the number, size, type and time of POST requests.
 
-    It counts and times them if there is a registry for the metrics.
+    If there is a registry for metrics, it also counts and times POST requests.
     """
 
     def __init__(self, app: _Server, limits: Limits, registry: CollectorRegistry | None = None) -> None:
@@ -274,7 +274,7 @@ class Guard:
     async def _post(self, scope: _Message, receive: _Receive, send: _Send) -> None:
         start_s = time.perf_counter()
         exchange = _Exchange(receive, send, self._limits)
-        # Unknown paths share a label: clients must not add labels.
+        # All unknown paths share one label, because clients must not be able to add labels.
         path = scope["path"] if scope["path"] in _PATHS else "none"
         refusal = self._find_refusal(Headers(scope=scope))
         try:
@@ -289,21 +289,21 @@ class Guard:
                 self._metrics.requests.labels(path, str(exchange.status or _CLIENT_GONE)).inc()
 
     def _find_refusal(self, headers: Headers) -> Response | None:
-        """Return the error response if the header already rules the request out."""
+        """Return an error response if the header shows that the request must be refused; None otherwise."""
         if not self._has_token(headers):
             return _refuse_token()
         if self._accepted >= self._limits.waiting:
-            detail = f"expected under {self._limits.waiting} pending requests, found as many; try again later"
+            detail = f"expected fewer than {self._limits.waiting} pending requests; try again later"
             return _make_refusal(503, detail, {"Retry-After": str(_RETRY_AFTER_S)})
         length = headers.get("content-length", "0")
         if length.isdecimal() and int(length) > self._limits.megabytes * 1e6:
             return _make_refusal(413, _describe_size_limit(self._limits))
         if not headers.get("content-type", "").lower().startswith("multipart/form-data"):
-            return _make_refusal(415, "expected multipart/form-data, a form with the pictures as files")
+            return _make_refusal(415, "expected the pictures as files of a form of type multipart/form-data")
         return None
 
     def _has_token(self, headers: Headers) -> bool:
-        """Return whether a request has the required token, if there is one."""
+        """Return whether a request has the required token; True if none is required."""
         token = self._limits.token
         if token is None:
             return True
@@ -324,7 +324,7 @@ class Guard:
 
 
 class _Exchange:
-    """A request, whose bytes are counted, and the status of its response; None before there is one."""
+    """A request with a count of its bytes, and the response's status, which is None until it is sent."""
 
     def __init__(self, receive: _Receive, send: _Send, limits: Limits) -> None:
         self._receive, self._send, self._limits = receive, send, limits
@@ -345,7 +345,7 @@ class _Exchange:
         self.status = message.get("status", self.status)
 
     async def run_while_connected(self, work: Coroutine[Any, Any, None]) -> None:
-        """Do the work; cancel it if the client disconnects."""
+        """Run a coroutine; cancel it if the client disconnects."""
         working, watching = asyncio.create_task(work), asyncio.create_task(self._wait_for_disconnect())
         watching.add_done_callback(lambda _: working.cancel())
         try:
@@ -357,13 +357,13 @@ class _Exchange:
             watching.cancel()
 
     async def _wait_for_disconnect(self) -> None:
-        """Wait for the whole request, then for the client to disconnect."""
+        """Wait until the whole request has arrived, then until the client disconnects."""
         await self._arrived.wait()
         while (await self._receive())["type"] != "http.disconnect":
             pass
 
     def refuse_late(self) -> Response:
-        """Return the error response to a request that exceeded the time limit."""
+        """Return the error response for a request that exceeded the time limit."""
         seconds = f"within {self._limits.timeout_s:g} s"
         if self._arrived.is_set():
             return _make_refusal(504, f"expected a result {seconds}, found none; send smaller pictures")
@@ -375,7 +375,7 @@ def _make_refusal(status: int, detail: str, headers: Mapping[str, str] | None = 
 
 
 def _refuse_token() -> Response:
-    detail = "expected the header Authorization: Bearer with this service's token, found none or another one"
+    detail = "expected the header Authorization: Bearer with this service's token, found none or a wrong one"
     return _make_refusal(401, detail, {"WWW-Authenticate": "Bearer"})
 
 

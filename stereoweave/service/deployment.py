@@ -1,4 +1,4 @@
-"""Runs the HTTP service on Ray Serve: clients post pictures and receive depth or views.
+"""HTTP service on Ray Serve: clients post pictures and receive depth or views.
 
 Each replica has its own network. A request waits for the current batch to finish; then all waiting requests
 are matched together.
@@ -39,11 +39,11 @@ from stereoweave.system.threads import usable_cores
 
 NAME = "stereoweave"
 GPU_PROVIDERS = ("cuda", "tensorrt")
-# Requests that wake up together arrive within this time.
+# Requests that resume together reach the batch within this time.
 _GATHERING_S = 0.005
 # All pairs of a batch are in memory at once, so a batch holds fewer large ones.
 _MEGAPIXELS_AT_ONCE = 32
-# In addition to waiting requests: these are refused, or ask for its health.
+# Number of requests in addition to the waiting ones: they are refused, or only check the service's health.
 _MOST_QUEUED = 200
 # A replica starts in seconds; the first on a machine also compiles the kernels.
 _TRIAL_LIMIT_S = 120
@@ -56,10 +56,10 @@ class Settings(BaseModel):
     Attributes:
         model: As in `Matcher`.
         provider: As in `Matcher`.
-        threads: Threads of each replica.
-        replicas: The number of processes, each with its own network.
-        batch: The maximum number of pairs to match together. On a CPU a batch is no faster: on two cores a
-            pair of 640x480 px takes 400, 390 and 405 ms in batches of one, two and four.
+        threads: Number of threads of each replica.
+        replicas: Number of replicas; each is a process with its own network.
+        batch: Maximum number of pairs to match together. On a CPU, larger batches are no faster: on two
+            cores, a pair of 640x480 px takes 400, 390 and 405 ms in batches of one, two and four.
         limits: Limits of each replica.
     """
 
@@ -74,7 +74,7 @@ class Settings(BaseModel):
 
     @property
     def backend(self) -> Backend:
-        """What each replica matches with."""
+        """The backend of each replica."""
         return Backend(model=self.model, threads=self.threads, provider=self.provider)
 
     @property
@@ -85,7 +85,7 @@ class Settings(BaseModel):
 
 @serve.ingress()
 class Replica:
-    """A process of the service that answers jobs; on a cluster also HTTP requests."""
+    """A process of the service: it answers jobs and, on a cluster, also HTTP requests."""
 
     def __init__(self, settings: Settings) -> None:
         self._settings, self._resources = settings, ExitStack()
@@ -93,7 +93,7 @@ class Replica:
         self._processes = _make_processes(settings, self._folder)
         self._resources.callback(self._processes.close)
         self._budget = Budget(self._processes.warm_up())
-        # One thread for each process: calls that wait for it are not sent yet, and can be cancelled.
+        # One thread per process: a call that waits for the thread is not sent yet, and can be cancelled.
         self._measuring_thread, self._answering_thread = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
         self._idle = asyncio.Event()
         self._idle.set()
@@ -101,7 +101,7 @@ class Replica:
             max_batch_size=settings.batch, batch_wait_timeout_s=_GATHERING_S, batch_size_fn=self._count_share
         )(self._answer_batch)
 
-    def __del__(self) -> None:  # Ray Serve calls it to end a replica
+    def __del__(self) -> None:  # Ray Serve calls this to end a replica
         self._resources.close()
 
     def __serve_build_asgi_app__(self) -> Guard:
@@ -109,14 +109,14 @@ class Replica:
         return Guard(make_app(self._answer, limits, self._folder), limits)
 
     async def try_answer(self, job: ServiceJob, left_s: float) -> ServiceAnswer | Exception:
-        """The answer to a job within the seconds that are left for it, or the error."""
+        """Return the answer to a job, or its error, within `left_s` seconds."""
         try:
             return await self._answer(job, left_s)
         except FAILURES as error:
             return error
 
     async def _answer(self, job: ServiceJob, left_s: float) -> ServiceAnswer:
-        """The answer to a job. A job that is cancelled while it waits never starts."""
+        """Return the answer to a job. A job that is cancelled while it waits never starts."""
         deadline_s = time.monotonic() + left_s
         loop = asyncio.get_running_loop()
         megapixels = await loop.run_in_executor(self._measuring_thread, self._processes.measure, job, left_s)
@@ -143,7 +143,7 @@ class Replica:
         return answers
 
     def _count_share(self, timed_jobs: Sequence[TimedJob]) -> int:
-        """Return the share of a batch that jobs fill, in pairs."""
+        """Return how many places of a batch the jobs fill; a large pair fills several."""
         most = self._settings.batch
         return sum(
             min(math.ceil(timed.megapixels * most / _MEGAPIXELS_AT_ONCE), most) for timed in timed_jobs
@@ -151,7 +151,10 @@ class Replica:
 
 
 def application(settings: Settings) -> serve.Application:
-    """The service for `serve.run`, and as stereoweave.service:application for a Serve config file."""
+    """Return the service as a Serve application.
+
+    Pass it to `serve.run`, or name it stereoweave.service:application in a Serve config file.
+    """
     deployed = serve.deployment(
         name=NAME,
         num_replicas=settings.replicas,
@@ -159,7 +162,7 @@ def application(settings: Settings) -> serve.Application:
         max_ongoing_requests=settings.limits.waiting + _MOST_QUEUED,
         max_queued_requests=_MOST_QUEUED,
         graceful_shutdown_timeout_s=settings.limits.timeout_s,
-        # If a network fails to load, further tries fail too.
+        # If a network fails to load, further attempts would fail too.
         max_constructor_retry_count=2,
         logging_config=_LOGGING,
     )
@@ -168,11 +171,11 @@ def application(settings: Settings) -> serve.Application:
 
 @contextmanager
 def run_service(settings: Settings, listener: socket.socket, address: str | None = None) -> Iterator[None]:
-    """Run the service within the block; at its end finish the accepted requests.
+    """Run the service within the block, and finish the accepted requests at its end.
 
     Args:
         settings: Settings of the service.
-        listener: The socket to serve at. On a cluster it is closed, and Ray's own proxies listen at its port
+        listener: The socket to listen on. On a cluster it is closed, and Ray's own proxies listen on its port
             on each machine that has a replica.
         address: As in `Engine`; the cluster must not serve another application.
 
@@ -183,7 +186,7 @@ def run_service(settings: Settings, listener: socket.socket, address: str | None
     engine = Engine(address, cpus_each=settings.threads, gpus_each=settings.gpus_each)
     if address is None:
         _check_slots(settings, usable_cores() // settings.threads)
-        # Report its errors before Ray starts, which takes seconds.
+        # Report a network's errors before Ray starts, because starting takes seconds.
         Matcher(settings.model, provider=settings.provider)
     logging.getLogger("ray.serve").setLevel(logging.CRITICAL)
     with connect(engine):
@@ -212,7 +215,7 @@ def _serve_at_server(settings: Settings, listener: socket.socket) -> Iterator[No
                 raise
             except RayActorError as error:
                 raise ProcessDiedError(
-                    "expected a replica that answers, found that it ended; try again later"
+                    "the replica ended before it answered the request; try again later"
                 ) from error
             if isinstance(outcome, Exception):
                 raise outcome
@@ -240,12 +243,12 @@ def _serve_at_proxies(settings: Settings, listener: socket.socket) -> Iterator[N
 
 
 def _check_free(address: str | None) -> None:
-    """Raise an error if the cluster serves already: Ray Serve cannot listen at a second port."""
+    """Raise an error if the cluster already serves applications: Ray Serve cannot listen on a second port."""
     others = serve.status().applications
     if others:
         raise StereoweaveError(
-            f"{address}: expected a cluster that serves nothing yet, found {', '.join(others)}; "
-            "`serve shutdown` ends that, or add stereoweave.service:application to its Serve config file"
+            f"{address}: expected a cluster without Serve applications, found {', '.join(others)}; end them "
+            "with `serve shutdown`, or add stereoweave.service:application to their Serve config file"
         )
 
 
@@ -255,20 +258,23 @@ def _start_replicas(settings: Settings) -> DeploymentHandle[Any]:
         return serve.run(application(settings), name=NAME, route_prefix="/")
     except RuntimeError as error:
         cause = StereoweaveError.from_error(_find_start_error(settings) or error)
-        cause = cause.with_prefix("expected a network that loads where the service runs, found ")
-        raise cause.with_detail("is the model there too?") from error
+        cause = cause.with_prefix("a replica could not load the network: ")
+        raise cause.with_detail("is the model on every machine of the service?") from error
 
 
 def _find_start_error(settings: Settings) -> StereoweaveError | None:
-    """Return why replicas did not start, from a trial on each machine: Ray Serve reports it only as text."""
-    _stop_replicas()  # replicas that did start may leave no room
+    """Return the error that prevents replicas from starting; None if no machine reproduces it.
+
+    Each machine tries to start a replica's processes, because Ray Serve reports errors only as text.
+    """
+    _stop_replicas()  # replicas that did start may leave no room for the trials
     engine = Engine(cpus_each=settings.threads, gpus_each=settings.gpus_each)
     errors = call_on_each_machine(_try_start, settings, engine, _TRIAL_LIMIT_S)
     return next(filter(None, errors), None)
 
 
 def _try_start(settings: Settings) -> StereoweaveError | None:
-    """Do what a replica does to start; return the error, if any."""
+    """Start a replica's processes as a trial; return the error, if any."""
     try:
         with make_own_folder() as folder, closing(_make_processes(settings, folder)) as processes:
             processes.warm_up()
@@ -282,27 +288,27 @@ def _make_processes(settings: Settings, folder: Path) -> ReplicaProcesses:
 
 
 def _stop_replicas() -> None:
-    """End the replicas, each after its accepted requests."""
+    """End each replica after it has answered its accepted requests."""
     while NAME in serve.status().applications:
-        with suppress(TimeoutError):  # raised after a minute; a request may take longer
+        with suppress(TimeoutError):  # raised after a minute, but a request may take longer
             serve.delete(NAME)
 
 
 def _check_slots(settings: Settings, found: int) -> None:
-    """Raise an error if the replicas do not fit: Ray would wait for more room without a message."""
+    """Raise an error if the replicas do not fit: Ray would silently wait for more room."""
     if settings.replicas > found:
         gpu = " and a GPU" if settings.gpus_each else ""
         raise StereoweaveError(
-            f"expected at most {found}, for which there is room, found {settings.replicas}; each takes "
-            f"{settings.threads} cores{gpu}",
+            f"expected at most {found}, as each takes {settings.threads} cores{gpu}, "
+            f"found {settings.replicas}",
             setting="replicas",
             remedy=Remedy("ask for less", ("replicas", "threads")),
         )
 
 
 def _count_replica_slots(engine: Engine) -> int:
-    """The number of replicas that fit on the cluster."""
+    """Return the number of replicas that fit on the cluster."""
     try:
         return count_slots(engine)
-    except StereoweaveError:  # none fits; the error names settings of another command
+    except StereoweaveError:  # no replica fits, and the error names settings of another command
         return 0

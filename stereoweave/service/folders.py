@@ -1,4 +1,4 @@
-"""Temporary folders of the service's processes, and the removal of those that killed processes left."""
+"""Temporary folders of the service's processes, and removal of folders that killed processes left behind."""
 
 import shutil
 import tempfile
@@ -14,9 +14,10 @@ _PREFIX, _LOCK = "stereoweave-service-", ".lock"
 
 @contextmanager
 def make_own_folder() -> Iterator[Path]:
-    """Make a temporary folder for the block, readable by this user only.
+    """Make a temporary folder that only this user can read, and remove it at the end of the block.
 
-    A lock file beside it marks it as in use. The system releases the lock when the process ends in any way.
+    A locked file beside the folder marks it as in use. The operating system releases the lock when the
+    process ends, even if it is killed.
     """
     _remove_abandoned()
     folder = Path(tempfile.gettempdir(), f"{_PREFIX}{uuid4().hex}")
@@ -27,14 +28,14 @@ def make_own_folder() -> Iterator[Path]:
             yield folder
         finally:
             shutil.rmtree(folder, ignore_errors=True)
-            # A cleaner of /tmp may have removed it, and Windows keeps it while it is open.
+            # A cleaner of /tmp may have removed the lock file. Windows keeps the file while it is open.
             with suppress(OSError):
                 Path(lock.lock_file).unlink()
 
 
 def _remove_abandoned() -> None:
     for path in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*{_LOCK}"):
-        # OSError: it is in use, or belongs to another user.
+        # OSError: the folder is in use, or belongs to another user.
         with suppress(OSError), FileLock(path, blocking=False):
             shutil.rmtree(path.with_suffix(""), ignore_errors=True)
             path.unlink()

@@ -29,7 +29,7 @@ _RANGE = r"^-?\d{1,6}(\.\d{1,6})?,-?\d{1,6}(\.\d{1,6})?$"
 
 def _check_range(text: str | None) -> str | None:
     if text is not None and not re.fullmatch(_RANGE, text):
-        raise ValueError(f"expected least and greatest disparity, such as -20,150, found {text[:40]!r}")
+        raise ValueError(f"expected the least and greatest disparity, such as -20,150, found {text[:40]!r}")
     return text
 
 
@@ -40,7 +40,7 @@ class PairForm(BaseModel):
 
     left: Annotated[UploadFile | None, Field(description="Left picture.")] = None
     right: Annotated[UploadFile | None, Field(description="Right picture, of the same size.")] = None
-    picture: Annotated[UploadFile | None, Field(description="Instead: one picture with both views.")] = None
+    picture: Annotated[UploadFile | None, Field(description="One picture of both views, instead.")] = None
     format: Annotated[
         Literal[FORMATS] | None,  # type: ignore[valid-type]
         Field(description="Layout of `picture` (default: detected)."),
@@ -68,7 +68,7 @@ class PairForm(BaseModel):
     check: Annotated[bool, Field(description="Check the pair and report its problems in the notes.")] = False
 
     def uploads(self) -> dict[str, datastructures.UploadFile]:
-        """Return the pictures by field: left and right, or picture."""
+        """Return the uploaded pictures by field name: left and right, or picture alone."""
         given = {"left": self.left, "right": self.right, "picture": self.picture}
         pictures: dict[str, datastructures.UploadFile] = {
             field: upload for field, upload in given.items() if upload is not None
@@ -81,7 +81,7 @@ class PairForm(BaseModel):
         return pictures
 
     def job_arguments(self, calibration: Path | None) -> dict[str, Any]:
-        """Return the arguments for `ServiceJob` that the form states."""
+        """Return the arguments of `ServiceJob` that the form's fields determine."""
         request = Request(
             format=self.format,
             calibration=calibration,
@@ -92,7 +92,7 @@ class PairForm(BaseModel):
         return {"request": request, "options": self.options(), "checked": self.check}
 
     def options(self) -> MatchOptions:
-        """Return the matching options."""
+        """Return the form's matching options."""
         return MatchOptions(range_px=self._range_px())
 
     def _range_px(self) -> tuple[float, float] | None:
@@ -112,7 +112,7 @@ class MapForm(PairForm):
     ] = "png"
 
     def options(self) -> MatchOptions:
-        """Return the matching options, refined on request."""
+        """Return the form's matching options, including refinement."""
         return replace(super().options(), refined=self.refined)
 
 
@@ -129,12 +129,12 @@ class ViewForm(PairForm):
     file: Annotated[Literal["png", "jpg"], Field(description="File format.")] = "png"
 
     def job_arguments(self, calibration: Path | None) -> dict[str, Any]:
-        """Return the arguments for `ServiceJob`, with the viewpoint."""
+        """Return the arguments of `ServiceJob` that the form's fields determine, including the viewpoint."""
         return super().job_arguments(calibration) | {"position": self.position, "strength": self.strength}
 
 
 def store_uploads(form: PairForm, folder: Path, file: str, most_megapixels: float) -> ServiceJob:
-    """Store a form's files in a folder, under the service's own names, and return its job."""
+    """Store a form's files in a folder, named by their fields, and return the form's job."""
     uploads = form.uploads()
     for field, upload in uploads.items():
         with (folder / field).open("wb") as out:

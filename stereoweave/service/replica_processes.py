@@ -1,4 +1,4 @@
-"""A replica's child processes, which read and match; replaced when they overrun or crash."""
+"""Child processes of a replica: they match pictures, and are replaced after a timeout or a crash."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -10,7 +10,7 @@ from stereoweave.pictures.prepare import Request
 from stereoweave.service.answers import BatchAnswerer, ServiceAnswer, ServiceJob, load_measurer
 from stereoweave.system.child_process import ChildProcess, ProcessDiedError
 
-# Reading the head of a picture takes milliseconds.
+# Reading a picture's header takes milliseconds.
 _MEASURING_LIMIT_S = 10
 _SAMPLE = Path(__file__).parents[1] / "sample"
 
@@ -25,16 +25,17 @@ class TimedJob:
 
     @property
     def left_s(self) -> float:
-        """The seconds until the deadline, at least 0."""
+        """Seconds until the deadline, at least 0."""
         return max(0.0, self.deadline_s - time.monotonic())
 
 
 class ReplicaProcesses:
-    """Two processes: one measures pictures from their heads, the other decodes and matches them.
+    """Two child processes: one reads pictures' sizes from their headers, the other matches the pictures.
 
     Args:
-        load_answerer: Makes the second one's function, such as `partial(load_answerer, Backend())`.
-        folder: For the temporary files of both.
+        load_answerer: Called in the second process; returns the function that answers jobs. An example is
+            `partial(load_answerer, Backend())`.
+        folder: Folder for the temporary files of both processes.
     """
 
     def __init__(self, load_answerer: Callable[[], BatchAnswerer], folder: Path) -> None:
@@ -42,12 +43,12 @@ class ReplicaProcesses:
         self._answerer = ChildProcess(load_answerer, folder / "answering")
 
     def close(self) -> None:
-        """End the processes."""
+        """End both processes."""
         self._measurer.close()
         self._answerer.close()
 
     def warm_up(self) -> float:
-        """Compile all kernels, then measure the seconds per megapixel of an unrefined disparity.
+        """Compile all kernels, and return the seconds per megapixel for an unrefined disparity.
 
         Raises:
             MatcherError: If the network cannot be loaded.
@@ -64,11 +65,11 @@ class ReplicaProcesses:
         return took_s / self._measurer(plain, timeout_s=None)
 
     def measure(self, job: ServiceJob, left_s: float) -> float:
-        """The megapixels of a job's pictures, from their heads.
+        """Return the number of megapixels of a job's pictures, read from their headers.
 
         Raises:
-            StereoweaveError: If `check_pixels` raises it, or the process crashed.
-            TimeoutError: If it takes longer than `left_s`.
+            StereoweaveError: If `check_pixels` raises one, or the process crashes.
+            TimeoutError: If this takes longer than `left_s`.
         """
         try:
             return self._measurer(job, min(left_s, _MEASURING_LIMIT_S))
@@ -76,15 +77,15 @@ class ReplicaProcesses:
             if left_s < _MEASURING_LIMIT_S:
                 raise
             raise FormatError(
-                f"expected pictures whose sizes are known within {_MEASURING_LIMIT_S} s, found that it takes "
-                "longer; save them again"
+                f"the sizes of the pictures could not be read within {_MEASURING_LIMIT_S} s; "
+                "save the pictures again"
             ) from error
 
     def answer(self, timed_jobs: Sequence[TimedJob]) -> list[ServiceAnswer | Exception]:
-        """The answer to each job, or its error.
+        """Return each job's answer or error.
 
-        At the first deadline, or if the process crashes, it is replaced, and the other jobs start again, one
-        by one.
+        If the jobs miss the earliest of their deadlines, or the process crashes, the process is replaced and
+        the jobs are repeated one by one.
         """
         try:
             jobs = [timed.job for timed in timed_jobs]

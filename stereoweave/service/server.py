@@ -1,6 +1,6 @@
-"""HTTP server of `stereoweave serve`: uvicorn with limits on the time and the bytes of a connection.
+"""HTTP server of `stereoweave serve`: uvicorn with limits on slow clients and large request headers.
 
-Ray Serve's own proxy has no such limits: it keeps a request head of any length in memory.
+Ray Serve's own proxy has no such limits: it keeps request headers of any length in memory.
 """
 
 import asyncio
@@ -18,21 +18,21 @@ import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 _MOST_HEAD_BYTES = 16 * 1024
-# Bytes to parse at a time: h11 takes 40 us for a chunk, even of one byte, while other connections wait.
+# Bytes to parse at a time: other connections wait while h11 spends 40 us on each chunk, even of one byte.
 _PARSED_BYTES = 4096
-# Each takes a file descriptor; a process usually has 1024. All waiting connections are accepted at once,
-# before any is closed.
+# Each connection takes a file descriptor, and a process usually has 1024. All waiting connections are
+# accepted at once, before any is closed.
 _MOST_CONNECTIONS, _WAITING_CONNECTIONS = 500, 100
 
 
 @dataclass(frozen=True)
 class ClientTimeouts:
-    """How long a server waits for its clients.
+    """Time limits of the HTTP server.
 
     Attributes:
-        head_s: Seconds for the whole head of the next request.
-        reader_s: Seconds for a client to read a response, which stays in memory meanwhile.
-        end_s: Seconds for requests in progress when the server ends.
+        head_s: Time for all headers of the next request to arrive.
+        reader_s: Time for a client to read a response, which stays in memory until then.
+        end_s: Time to finish the requests in progress when the server ends.
     """
 
     head_s: float = 10
@@ -41,9 +41,9 @@ class ClientTimeouts:
 
 
 class _Connection(H11Protocol, asyncio.BufferedProtocol):
-    """A connection that closes if a request head is late, or the client reads a response too slowly.
+    """A connection that is closed if the client is too slow to send request headers or to read a response.
 
-    If there are too many connections, the one that has waited longest for a request head is closed.
+    If there are too many connections, the one that has waited longest for request headers is closed.
     """
 
     def __init__(self, timeouts: ClientTimeouts, *args: Any, **options: Any) -> None:
@@ -60,7 +60,7 @@ class _Connection(H11Protocol, asyncio.BufferedProtocol):
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
-        transport.set_write_buffer_limits(high=0)  # pauses writing until the client has read all
+        transport.set_write_buffer_limits(high=0)  # pause writing until the client has read everything
         self._expect_head()
         if len(self.connections) > _MOST_CONNECTIONS:
             waiting = [each for each in self.connections if isinstance(each, _Connection) and each._is_idle()]
@@ -77,7 +77,7 @@ class _Connection(H11Protocol, asyncio.BufferedProtocol):
         can_respond = self.conn.our_state in (h11.IDLE, h11.SEND_RESPONSE)
         if self._is_busy():
             can_respond = can_respond and self.scope["method"] != "HEAD"  # no body allowed
-            self.cycle.disconnected = True  # drops further output of the application
+            self.cycle.disconnected = True  # drop further output of the application
             self.cycle.message_event.set()
         if can_respond:
             super().send_400_response(msg)
@@ -114,7 +114,7 @@ class _Connection(H11Protocol, asyncio.BufferedProtocol):
         return math.inf if self._deadline is None else self._deadline.when()
 
     def _expect_head(self) -> None:
-        """Start to wait for the next head, unless it has arrived or the client is still reading."""
+        """Limit the wait for the next request's headers, unless a request or a response is in progress."""
         if self._is_idle():
             self._close_within(self._timeouts.head_s)
 
@@ -126,13 +126,13 @@ class _Connection(H11Protocol, asyncio.BufferedProtocol):
 
 @contextmanager
 def run_http_server(app: Any, listener: socket.socket, timeouts: ClientTimeouts) -> Iterator[None]:
-    """Serve an ASGI application at a socket within the block, in a thread."""
+    """Serve an ASGI application on a socket, in a separate thread, until the block ends."""
     config = uvicorn.Config(
         app,
         http=partial(_Connection, timeouts),  # type: ignore[arg-type]
         h11_max_incomplete_event_size=_MOST_HEAD_BYTES,
         ws="none",
-        loop="asyncio",  # uvloop fails at its end if a connection was aborted
+        loop="asyncio",  # uvloop fails on exit if a connection was aborted
         proxy_headers=False,
         server_header=False,
         access_log=False,

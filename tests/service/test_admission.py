@@ -11,25 +11,25 @@ def job(**said) -> ServiceJob:
     return ServiceJob(folder=Path(), pictures=(Path("left"), Path("right")), **{"file": "depth.png", **said})
 
 
-def test_what_takes_longer_than_the_time_that_is_left_is_refused():
+def test_a_job_that_alone_takes_longer_than_the_remaining_time_is_refused():
     budget = Budget(seconds_each=2)
     with budget.admit(job(), megapixels=4, left_s=20):
         pass
-    with pytest.raises(TooLargeError, match="at most 20 s, found 4.2 megapixels, which take 21 s"):
+    with pytest.raises(TooLargeError, match="at most 20 s, found 4.2 megapixels that take 21 s"):
         budget.admit(job(), megapixels=4.2, left_s=20).__enter__()
 
 
-def test_what_would_be_late_after_those_before_it_is_to_come_again_when_they_are_done():
+def test_a_job_that_would_be_late_after_pending_jobs_may_be_retried_when_they_are_done():
     budget = Budget(seconds_each=2)
     with budget.admit(job(), megapixels=2, left_s=5), budget.admit(job(), megapixels=0.5, left_s=5):
-        with pytest.raises(BusyError, match="found 2 s more") as busy:
+        with pytest.raises(BusyError, match="make this one 2 s late") as busy:
             budget.admit(job(), megapixels=0.8, left_s=5).__enter__()
         assert busy.value.retry_after_s == 2  # 4 + 1 + 1.6 - 5, rounded up
     with budget.admit(job(), megapixels=2, left_s=5):
         pass
 
 
-def test_what_the_best_speed_allows_is_accepted_where_nothing_waits():
+def test_without_pending_jobs_any_job_that_the_best_speed_allows_is_accepted():
     budget = Budget(seconds_each=2)
     budget.learn(work=10, took_s=10)
     budget.learn(work=10, took_s=500)
@@ -37,18 +37,18 @@ def test_what_the_best_speed_allows_is_accepted_where_nothing_waits():
         pass
 
 
-def test_what_waits_is_taken_to_be_done_at_the_usual_speed():
+def test_pending_jobs_are_expected_to_run_at_the_usual_speed():
     budget = Budget(seconds_each=1)
     for took_s in (30, 30, 500):
         budget.learn(work=10, took_s=took_s)
     with budget.admit(job(), megapixels=1, left_s=6):
-        with pytest.raises(BusyError, match="found 3 s more"):
+        with pytest.raises(BusyError, match="make this one 3 s late"):
             budget.admit(job(), megapixels=2, left_s=6).__enter__()
         with budget.admit(job(), megapixels=1, left_s=6):
             pass
 
 
-def test_speeds_of_long_ago_are_forgotten():
+def test_old_speeds_are_forgotten():
     budget = Budget(seconds_each=50)
     for _ in range(9):
         budget.learn(work=1, took_s=2)
@@ -56,12 +56,12 @@ def test_speeds_of_long_ago_are_forgotten():
         pass
 
 
-def test_what_was_stopped_unfinished_makes_the_usual_speed_slower_and_the_best_no_better():
+def test_an_unfinished_job_slows_the_usual_speed_but_leaves_the_best_speed_unchanged():
     budget = Budget(seconds_each=2)
     budget.learn(work=1, took_s=8, finished=False)
-    budget.learn(work=8, took_s=1, finished=False)  # had little time left: counts as the median, 5
-    with budget.admit(job(), megapixels=1, left_s=2), pytest.raises(BusyError, match="found 1 s more"):
-        budget.admit(job(), megapixels=1, left_s=9).__enter__()  # the median of 2, 5 and 8, twice, less 9
+    budget.learn(work=8, took_s=1, finished=False)  # stopped early, so it counts as the median, 5
+    with budget.admit(job(), megapixels=1, left_s=2), pytest.raises(BusyError, match="one 1 s late"):
+        budget.admit(job(), megapixels=1, left_s=9).__enter__()  # twice the median of 2, 5 and 8, minus 9
     with pytest.raises(TooLargeError, match="take 2 s"):
         budget.admit(job(), megapixels=1, left_s=1.9).__enter__()
 

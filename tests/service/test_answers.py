@@ -30,7 +30,7 @@ def estimate(photos) -> sw.Estimate:
 
 
 def job(folder: Path, left: bytes = BOTH["left"], **said: Any) -> ServiceJob:
-    """For disparity.npy of a pair, in a folder that is made."""
+    """Make a folder with a pair, and return a job for the pair's disparity.npy."""
     folder.mkdir()
     (folder / "left").write_bytes(left)
     (folder / "right").write_bytes(BOTH["right"])
@@ -39,13 +39,13 @@ def job(folder: Path, left: bytes = BOTH["left"], **said: Any) -> ServiceJob:
     )
 
 
-def test_those_that_are_matched_together_get_what_each_gets_alone(estimate, tmp_path):
+def test_jobs_matched_together_get_the_same_answers_as_alone(estimate, tmp_path):
     jobs = [
         job(tmp_path / "first"),
         job(tmp_path / "damaged", left=b"no picture"),
         job(tmp_path / "second"),
         job(tmp_path / "with a range", options=MatchOptions(range_px=(8, 16))),
-        job(tmp_path / "with a range that is none", options=MatchOptions(range_px=(5000, 6000))),
+        job(tmp_path / "with an invalid range", options=MatchOptions(range_px=(5000, 6000))),
     ]
     first, damaged, second, within, beyond = answer_many(Matcher("small"), jobs)
     for answer in (first, second):
@@ -55,7 +55,7 @@ def test_those_that_are_matched_together_get_what_each_gets_alone(estimate, tmp_
     assert "range_px" in str(beyond)
 
 
-def test_nothing_is_left_of_a_request_whose_client_goes_away_while_it_is_matched(tmp_path):
+def test_no_files_remain_if_the_client_disconnects_during_matching(tmp_path):
     folder = tmp_path / "pictures"
 
     class MatcherAtThatMoment(Matcher):
@@ -69,20 +69,20 @@ def test_nothing_is_left_of_a_request_whose_client_goes_away_while_it_is_matched
 
 @pytest.fixture
 def halves(photos, tmp_path) -> ServiceJob:
-    """Two views of 1280x480 px at half their width, of which its name alone tells."""
+    """Return a job with two views of 1280x480 px at half width, which only the file's name reveals."""
     write_image(tmp_path / "both_half_LR.png", np.hstack(photos))
     return ServiceJob(folder=tmp_path, pictures=(tmp_path / "both_half_LR.png",), file="disparity.npy")
 
 
 def jps_of(picture: Image.Image, flags: int) -> bytes:
-    """A JPS file of two views side by side; source: VRex's JPS, as `ExifTool` reads it."""
+    """Return a JPS file of two views side by side. Source: VRex's JPS format, as `ExifTool` reads it."""
     segment = b"\xff\xe3\x00\x12_JPSJPS_\x00\x04" + bytes([0, flags, 2, 1]) + bytes(2)
     stored = io.BytesIO()
     picture.save(stored, "JPEG", extra=segment)
     return stored.getvalue()
 
 
-def test_half_views_that_are_named_are_measured_by_the_head_of_their_picture(halves):
+def test_half_views_named_in_the_request_are_measured_from_the_pictures_header(halves):
     named = replace(halves, request=Request(format="side_by_side_half"))
     assert check_pixels(named) == 2 * 1280 * 480 / 1e6
     assert check_pixels(replace(named, most_megapixels=0.62)) == 2 * 1280 * 480 / 1e6
@@ -90,7 +90,7 @@ def test_half_views_that_are_named_are_measured_by_the_head_of_their_picture(hal
         check_pixels(replace(named, most_megapixels=0.6))
 
 
-def test_half_views_that_are_guessed_are_measured_again(halves):
+def test_detected_half_views_are_measured_again(halves):
     least = replace(halves, most_megapixels=0.6)
     assert check_pixels(least) == 1280 * 480 / 1e6
     (refusal,) = answer_many(Matcher("small"), [least])
@@ -99,7 +99,7 @@ def test_half_views_that_are_guessed_are_measured_again(halves):
 
 
 @pytest.mark.parametrize(("flags", "views"), [(4, 1), (4 | 2, 2), (4 | 1, 1)])
-def test_half_views_of_which_a_jps_file_says_so_are_measured_by_its_head(photos, tmp_path, flags, views):
+def test_half_views_declared_in_a_jps_file_are_measured_from_its_header(photos, tmp_path, flags, views):
     (tmp_path / "both").write_bytes(jps_of(Image.fromarray(np.hstack(photos)), flags))
     both = ServiceJob(folder=tmp_path, pictures=(tmp_path / "both",), file="disparity.npy")
     assert check_pixels(both) == views * 1280 * 480 / 1e6

@@ -1,4 +1,4 @@
-"""The service without a server, and with functions that do its work."""
+"""The service's HTTP interface without a server, with simple functions that answer the jobs."""
 
 import asyncio
 import tempfile
@@ -16,14 +16,14 @@ from stereoweave.service.admission import BusyError
 from stereoweave.service.answers import ServiceAnswer, ServiceJob, TooLargeError
 from stereoweave.system.child_process import ProcessDiedError
 
-# What Ray Serve is warned of by Pydantic when it is imported.
+# Pydantic warns about Ray Serve when that is imported.
 pytestmark = pytest.mark.filterwarnings("ignore:Using extra keyword arguments on `Field`:DeprecationWarning")
 
 
 def make_client(
     answer_job: Any, registry: CollectorRegistry | None = None, folder: Path | None = None, **limits: Any
 ) -> httpx.AsyncClient:
-    """A client of the service without a server, whose work is done by a function."""
+    """Return a client of the service without a server; a function answers its jobs."""
     from stereoweave.service.asgi import Guard, Limits, make_app
 
     allowed = Limits(**limits)
@@ -38,7 +38,7 @@ FORM = {"Content-Type": "multipart/form-data; boundary=b"}
 def ask_guard(
     answer_job: Any, content: AsyncIterator[bytes] | bytes | None = None, **limits: Any
 ) -> httpx.Response:
-    """The response of a guard that allows a fifth of a second, unless told otherwise."""
+    """Return the response of a guard, whose time limit is 0.2 s by default."""
 
     async def ask() -> httpx.Response:
         async with make_client(answer_job, **{"timeout_s": 0.2, **limits}) as client:
@@ -53,7 +53,7 @@ async def wait_forever(job: ServiceJob, left_s: float) -> ServiceAnswer:
     await asyncio.Event().wait()
 
 
-def test_a_provider_that_fails_is_no_fault_of_the_request():
+def test_a_failing_provider_is_a_server_error():
     async def fails(job: ServiceJob, left_s: float) -> ServiceAnswer:
         raise ProviderError(
             "provider cuda: expected to run /srv/net.onnx, found that it failed: out of memory"
@@ -66,13 +66,13 @@ def test_a_provider_that_fails_is_no_fault_of_the_request():
     )
 
 
-def test_what_takes_too_long_is_cancelled():
+def test_a_job_that_takes_too_long_is_cancelled():
     response = ask_guard(wait_forever)
     assert response.status_code == 504
     assert response.json()["detail"].startswith("expected a result within 0.2 s")
 
 
-def test_a_request_that_does_not_arrive_is_not_waited_for():
+def test_a_request_that_does_not_arrive_in_time_is_refused():
     async def stalls() -> AsyncIterator[bytes]:
         yield b"--b\r\n"
         await asyncio.Event().wait()
@@ -82,7 +82,7 @@ def test_a_request_that_does_not_arrive_is_not_waited_for():
     assert "found part of it" in response.json()["detail"]
 
 
-def test_as_many_requests_are_accepted_at_a_time_as_may_wait_and_no_more():
+def test_no_more_requests_are_accepted_at_once_than_the_limit_of_pending_ones():
     async def ask() -> list[int]:
         done, accepted = asyncio.Event(), []
 
@@ -104,7 +104,7 @@ def test_as_many_requests_are_accepted_at_a_time_as_may_wait_and_no_more():
     assert asyncio.run(ask()) == [503, 200, 200, 200]
 
 
-def test_a_request_without_a_length_is_refused_once_more_bytes_arrive_than_are_taken():
+def test_a_request_without_a_length_is_refused_once_it_exceeds_the_size_limit():
     sent = []
 
     async def streams() -> AsyncIterator[bytes]:
@@ -116,7 +116,7 @@ def test_a_request_without_a_length_is_refused_once_more_bytes_arrive_than_are_t
     response = ask_guard(wait_forever, streams(), megabytes=1, timeout_s=60)
     assert response.status_code == 413
     assert "expected a request of at most 1 MB" in response.json()["detail"]
-    assert sum(sent) == 1_000_000  # with the head of the part more than 1 MB
+    assert sum(sent) == 1_000_000  # exceeds 1 MB together with the header of the part
 
 
 @pytest.mark.parametrize(
@@ -133,7 +133,7 @@ def test_a_request_without_a_length_is_refused_once_more_bytes_arrive_than_are_t
         ({}, "/health", 200),
     ],
 )
-def test_where_there_is_a_token_all_but_health_need_it(headers, path, status):
+def test_if_a_token_is_set_every_path_but_health_requires_it(headers, path, status):
     async def get() -> httpx.Response:
         async with make_client(wait_forever, token="secret-1") as client:
             return await client.get(path, headers={k: v.encode("latin-1") for k, v in headers.items()})
@@ -146,7 +146,7 @@ def test_where_there_is_a_token_all_but_health_need_it(headers, path, status):
         assert response.json()["detail"].startswith("expected the header Authorization: Bearer")
 
 
-def test_without_the_token_not_even_the_body_of_a_form_is_read():
+def test_a_form_without_the_token_is_refused_before_its_body_is_read():
     async def never_sent() -> AsyncIterator[bytes]:
         await asyncio.Event().wait()
         yield b""
@@ -154,7 +154,7 @@ def test_without_the_token_not_even_the_body_of_a_form_is_read():
     assert ask_guard(wait_forever, never_sent(), token="secret").status_code == 401
 
 
-def test_work_for_a_client_that_goes_away_is_cancelled():
+def test_work_for_a_client_that_disconnects_is_cancelled():
     from stereoweave.service.asgi import Guard, Limits, make_app
 
     async def leave() -> bool:
@@ -202,7 +202,7 @@ def test_work_for_a_client_that_goes_away_is_cancelled():
         (TimeoutError("late"), 504, None),
     ],
 )
-def test_what_the_work_came_to_is_told_by_the_status(error, status, header):
+def test_each_kind_of_error_has_its_status(error, status, header):
     async def fails(job: ServiceJob, left_s: float) -> ServiceAnswer:
         raise error
 
@@ -216,7 +216,7 @@ async def answer_at_once(job: ServiceJob, left_s: float) -> ServiceAnswer:
     return ServiceAnswer(content=job.pictures[0].read_bytes(), report="{}")
 
 
-def test_a_folder_that_was_removed_meanwhile_is_made_again(tmp_path):
+def test_a_removed_upload_folder_is_made_again(tmp_path):
     folder = tmp_path / "emptied" / "own"
     response = ask_guard(answer_at_once, folder=folder, timeout_s=60)
     assert (response.status_code, response.content) == (200, BOTH["left"])
@@ -231,7 +231,7 @@ def test_a_folder_that_was_removed_meanwhile_is_made_again(tmp_path):
         (MemoryError(), "too little memory"),
     ],
 )
-def test_a_machine_without_room_is_no_fault_of_the_request(error, found):
+def test_a_full_disk_or_memory_is_a_server_error(error, found):
     async def fails(job: ServiceJob, left_s: float) -> ServiceAnswer:
         raise error
 
@@ -243,7 +243,7 @@ def test_a_machine_without_room_is_no_fault_of_the_request(error, found):
     assert "\n" not in detail
 
 
-def test_a_flood_of_requests_for_metrics_holds_no_other_up():
+def test_a_flood_of_metrics_requests_does_not_delay_other_requests():
     async def flood() -> tuple[int, set[int], str]:
         async with make_client(answer_at_once, CollectorRegistry(), timeout_s=3) as client:
             asked = [asyncio.create_task(client.get("/metrics")) for _ in range(50)]
@@ -268,7 +268,7 @@ def test_without_a_registry_there_are_no_metrics(monkeypatch):
     assert asyncio.run(get()).status_code == 404
 
 
-def test_a_response_that_could_not_be_begun_in_time_becomes_one_that_says_so():
+def test_a_response_that_cannot_start_in_time_is_replaced_by_a_timeout_error():
     from stereoweave.service.asgi import Guard, Limits, make_app
 
     async def answers(job: ServiceJob, left_s: float) -> ServiceAnswer:
@@ -280,7 +280,7 @@ def test_a_response_that_could_not_be_begun_in_time_becomes_one_that_says_so():
 
         async def to_a_slow_reader(scope: Any, receive: Any, send: Any) -> None:
             async def send_when_read(message: Any) -> None:
-                if unread:  # an earlier response, the first time
+                if unread:  # the first time: an earlier response is still unread
                     await unread.pop().wait()
                 await send(message)
 

@@ -34,7 +34,7 @@ from stereoweave.io.maps import read_disparity_png, read_pfm
 
 WAITING, MEGABYTES = 3, 4
 
-# What Ray Serve is warned of by Pydantic when it is imported.
+# Pydantic warns about Ray Serve when that is imported.
 pytestmark = [
     pytest.mark.system,
     pytest.mark.filterwarnings("ignore:Using extra keyword arguments on `Field`:DeprecationWarning"),
@@ -61,8 +61,8 @@ def running(tmp_path_factory) -> Iterator[Running]:
 
 @contextmanager
 def run_serve_command(uploads: Path, *words: object) -> Iterator[Running]:
-    """The command, in a process of its own, which has to end by itself, and all that it started with it."""
-    # Metrics each second, and not each ten. The names of the sockets of Ray may not be long.
+    """Run the command in another process, and check that it ends by itself and leaves no child process."""
+    # Ray reports metrics every ten seconds by default. The paths of its sockets must be short.
     ray = {"RAY_metrics_report_interval_ms": "1000", "RAY_TMPDIR": "/tmp"}
     process = subprocess.Popen(
         [sys.executable, "-m", "stereoweave", "serve", "--port", "0", *map(str, words)],
@@ -74,7 +74,7 @@ def run_serve_command(uploads: Path, *words: object) -> Iterator[Running]:
         with process.stdout:
             url = re.search(r"http://[\d.:]+", process.stdout.readline())[0]
             started = set(watching.list_descendants(process.pid))
-            # Each request has a connection of its own, as those of many clients.
+            # Each request has its own connection, like requests of different clients.
             alone = httpx.Limits(max_keepalive_connections=0)
             with httpx.Client(base_url=url, timeout=60, limits=alone) as client:
                 yield Running(client, process.pid, uploads)
@@ -89,7 +89,7 @@ def run_serve_command(uploads: Path, *words: object) -> Iterator[Running]:
 
 
 def wait_for_end(pids: set[int], within_s: float) -> list[int]:
-    """The processes that have not ended by then."""
+    """Wait for processes to end, and return those that have not ended in time."""
     deadline_s = time.monotonic() + within_s
     while (left := [pid for pid in pids if Path(f"/proc/{pid}").exists()]) and time.monotonic() < deadline_s:
         time.sleep(0.05)
@@ -117,14 +117,14 @@ def estimate(photos) -> sw.Estimate:
     return sw.estimate(*photos, model="small")
 
 
-def test_a_pair_gets_the_disparity_that_the_library_finds(service, estimate, tmp_path):
+def test_the_disparity_of_a_pair_equals_the_librarys(service, estimate, tmp_path):
     pfm = save_content(post(service, "/disparity", file="pfm"), tmp_path / "disparity.pfm")
     np.testing.assert_allclose(read_pfm(pfm), estimate.disparity_px, atol=1e-3)
     png = save_content(post(service, "/disparity"), tmp_path / "disparity.png")
     np.testing.assert_allclose(read_disparity_png(png), estimate.disparity_px, atol=1 / 256)
 
 
-def test_a_pair_and_its_calibration_get_depth_in_metres(service, estimate, photos, tmp_path):
+def test_a_pair_with_a_calibration_gives_depth_in_metres(service, estimate, photos, tmp_path):
     camera = add_camera(sw.StereoPair(left=photos[0], right=photos[1]), TEXTURED / "calib.txt").camera
     response = post(service, "/depth", {**BOTH, "calib": CALIB}, file="npy")
     depth_m = np.load(save_content(response, tmp_path / "depth.npy"), allow_pickle=False)
@@ -134,13 +134,13 @@ def test_a_pair_and_its_calibration_get_depth_in_metres(service, estimate, photo
     assert report["camera"]["focal_px"] == 600
 
 
-def test_a_view_is_the_one_of_the_library(service, photos, tmp_path):
+def test_a_view_equals_the_librarys(service, photos, tmp_path):
     view = save_content(post(service, "/view", position=0.3), tmp_path / "view.png")
     expected = sw.synthesize(*photos, 0.3, model="small").image.astype(int)
     assert np.abs(read_image(view) - expected).mean() < 0.01
 
 
-def test_one_picture_of_both_views_is_as_good_as_two(service, photos, tmp_path):
+def test_one_picture_of_both_views_gives_the_same_result_as_two_pictures(service, photos, tmp_path):
     write_image(tmp_path / "both.png", np.hstack(photos))
     picture = {"picture": (tmp_path / "both.png").read_bytes()}
     response = post(service, "/disparity", picture, format="side_by_side", file="tiff")
@@ -148,7 +148,7 @@ def test_one_picture_of_both_views_is_as_good_as_two(service, photos, tmp_path):
     assert response.content == whole.content
 
 
-def test_a_range_that_is_given_is_kept(service, tmp_path):
+def test_a_given_range_limits_the_disparity(service, tmp_path):
     pfm = save_content(post(service, "/disparity", range="8,16", file="pfm"), tmp_path / "disparity.pfm")
     assert read_pfm(pfm).min() == 8
     assert read_pfm(pfm).max() == 16
@@ -164,14 +164,14 @@ def test_no_malformed_request_is_answered_with_a_server_error(service):
     details = {
         name: json.loads(text)["detail"] for name, (_, text) in answers.items() if text.startswith("{")
     }
-    assert len(details) > len(requests) - 5  # to HTTP that is none, the server itself speaks
+    assert len(details) > len(requests) - 5  # the server itself answers invalid HTTP
     for name, detail in details.items():
         assert "\n" not in detail, name
         assert "/tmp" not in detail, name
     assert post(service, "/disparity").status_code == 200
 
 
-def test_a_service_that_is_full_refuses_and_does_what_it_accepted(service):
+def test_a_full_service_refuses_requests_and_answers_the_accepted_ones(service):
     with ThreadPoolExecutor(16) as pool:
         responses = list(pool.map(lambda _: post(service, "/disparity", refined=True), range(16)))
         health = service.get("/health")
@@ -183,7 +183,7 @@ def test_a_service_that_is_full_refuses_and_does_what_it_accepted(service):
     assert "try again later" in refused[0].json()["detail"]
 
 
-def test_hostile_requests_and_calibrations_leave_it_answering_at_once_and_small(running):
+def test_hostile_requests_and_calibrations_neither_delay_health_checks_nor_fill_memory(running):
     calibrations = dict(list(HOSTILE.items())[:: max(1, len(HOSTILE) // 60)])
     requests = {name: partial(post_calibration, content) for name, content in calibrations.items()}
     requests |= make_hostile_requests() | make_malformed_requests(MEGABYTES)
@@ -210,15 +210,15 @@ def test_hostile_requests_and_calibrations_leave_it_answering_at_once_and_small(
 def post_calibration(content: bytes, client: httpx.Client) -> tuple[int, str]:
     try:
         response = post(client, "/depth", {**BOTH, "calib": content})
-    except (httpx.ReadError, httpx.WriteError):  # refused, and closed, while it was still being sent
+    except (httpx.ReadError, httpx.WriteError):  # refused and closed while the request was still being sent
         return 503, ""
     return response.status_code, response.text
 
 
 def send_until_accepted(send: Sender, client: httpx.Client) -> int:
-    """The status that is answered once others have made room; 503 where they do not within five minutes.
+    """Send a request until it is accepted, and return its status; 503 if this takes over five minutes.
 
-    The slow ones among the others take all the time that the service allows, one after another.
+    Each slow request of the others takes the whole time limit of the service, one after another.
     """
     deadline_s = time.monotonic() + 300
     while (status := send(client)[0]) == 503 and time.monotonic() < deadline_s:
@@ -241,7 +241,7 @@ def test_only_requests_to_a_name_of_this_machine_are_answered(service, host, sta
         assert service.get(path, headers={"Host": host}).status_code == status
 
 
-def test_temporary_folders_that_were_removed_are_made_again_and_one_that_cannot_be_made_is_said(running):
+def test_removed_temporary_folders_are_made_again_and_a_failure_to_make_one_is_reported(running):
     for folder in running.uploads.glob("stereoweave-service-*/"):
         shutil.rmtree(folder)
     assert post(running.client, "/disparity").status_code == 200
@@ -255,7 +255,7 @@ def test_temporary_folders_that_were_removed_are_made_again_and_one_that_cannot_
     assert post(running.client, "/disparity").status_code == 200
 
 
-def test_its_description_names_every_path_and_field(service):
+def test_the_openapi_description_names_every_path_and_field(service):
     description = service.get("/openapi.json").json()
     assert description["openapi"].startswith("3.1")
     assert set(description["paths"]) == {"/disparity", "/depth", "/view", "/health", "/metrics"}
@@ -278,9 +278,9 @@ def parse_metrics(text: str) -> dict[str, Metric]:
     return {family.name: family for family in text_string_to_metric_families(text)}
 
 
-def test_its_metrics_count_requests_by_status(service):
+def test_the_metrics_count_requests_by_status(service):
     assert post(service, "/depth").status_code == 422  # no camera
-    with pytest.raises(httpx.ReadTimeout):  # the client goes away
+    with pytest.raises(httpx.ReadTimeout):  # the client disconnects
         service.post("/view", files=BOTH, timeout=httpx.Timeout(60, read=0.05))
     expected = {("/depth", "422"), ("/view", "499"), ("/disparity", "200"), ("/disparity", "503")}
     deadline_s = time.monotonic() + 30
@@ -294,16 +294,16 @@ def test_its_metrics_count_requests_by_status(service):
     assert families["stereoweave_request_seconds"].type == "histogram"
 
 
-def test_ray_s_own_exporter_has_what_replicas_count(running):
+def test_rays_own_exporter_has_the_metrics_of_the_replicas(running):
     deadline_s = time.monotonic() + 30
     while not (families := read_ray_metrics(running.pid)) and time.monotonic() < deadline_s:
         time.sleep(0.2)
     batches = {s.labels.get("le"): s.value for s in families["ray_serve_actual_batch_size"].samples}
-    assert batches["+Inf"] > batches["1.0"]  # some were of two
+    assert batches["+Inf"] > batches["1.0"]  # some batches held two pairs
 
 
 def read_ray_metrics(pid: int) -> dict[str, Metric]:
-    """The metrics at the port of Ray's exporter, which is one of the ports that the service opens."""
+    """Return the metrics of Ray's exporter, which listens on one of the ports that the service opens."""
     for process in psutil.Process(pid).children(recursive=True):
         for connection in process.net_connections("tcp"):
             if connection.status == psutil.CONN_LISTEN:
@@ -314,7 +314,7 @@ def read_ray_metrics(pid: int) -> dict[str, Metric]:
     return {}
 
 
-def test_a_port_that_is_taken_is_one_line(capsys):
+def test_a_port_in_use_is_reported_in_one_line(capsys):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         assert main(["serve", "--port", str(port)]) == 2
@@ -346,42 +346,42 @@ def test_a_port_that_is_taken_is_one_line(capsys):
         ),
     ],
 )
-def test_what_cannot_be_served_is_said_before_ray_starts(words, expected, capsys):
+def test_invalid_settings_are_reported_before_ray_starts(words, expected, capsys):
     assert main(["serve", "--port", "0", *words]) == 2
     printed = capsys.readouterr().err
     assert expected in printed
     assert printed.count("\n") == 1
 
 
-def test_a_cluster_without_room_is_said_and_not_waited_for(ray_address, capsys):
+def test_a_cluster_without_room_is_reported_at_once(ray_address, capsys):
     assert main(["serve", "--port", "0", "--address", ray_address, "--threads", "3"]) == 2
     printed = capsys.readouterr().err
     assert printed == (
-        "stereoweave: --replicas: expected at most 0, for which there is room, found 1; each takes 3 cores; "
+        "stereoweave: --replicas: expected at most 0, as each takes 3 cores, found 1; "
         "ask for less (--replicas, --threads)\n"
     )
 
 
-def test_a_network_that_the_cluster_does_not_have_is_named(ray_address, capsys):
+def test_a_network_missing_on_the_cluster_is_named(ray_address, capsys):
     words = ["--address", ray_address, "--threads", "1", "--model", "none.onnx"]
     assert main(["serve", "--port", "0", *words]) == 2
     printed = capsys.readouterr().err
     assert (
-        "found none.onnx: expected an ONNX matcher file, found no such file; is the model there too?"
-        in printed
+        "a replica could not load the network: none.onnx: expected an ONNX matcher file, found no such file; "
+        "is the model on every machine of the service?" in printed
     )
     assert printed.count("\n") == 1
 
 
-def test_an_error_of_a_replica_names_its_setting_as_an_option(ray_address, capsys):
+def test_a_replicas_error_names_its_setting_as_an_option(ray_address, capsys):
     words = ["--address", ray_address, "--threads", "1", "--provider", "abacus"]
     assert main(["serve", "--port", "0", *words]) == 2
     assert capsys.readouterr().err.startswith(
-        "stereoweave: --provider: expected a network that loads where the service runs, found expected one"
+        "stereoweave: --provider: a replica could not load the network: expected one"
     )
 
 
-def test_what_the_command_says_of_hosts_and_the_token_holds_for_the_service(tmp_path, monkeypatch):
+def test_the_command_passes_hosts_and_token_to_the_service(tmp_path, monkeypatch):
     kept = []
 
     def run_service(settings: Any, listener: socket.socket, address: str | None) -> None:
@@ -404,15 +404,15 @@ def test_what_the_command_says_of_hosts_and_the_token_holds_for_the_service(tmp_
     assert "se-cret" not in repr(kept)
 
 
-def test_on_a_cluster_the_proxies_of_ray_serve_the_same(ray_address, tmp_path):
+def test_on_a_cluster_rays_proxies_answer_the_same_requests(ray_address, tmp_path):
     with run_serve_command(tmp_path, "--address", ray_address, "--threads", 1) as running:
         assert post(running.client, "/disparity").status_code == 200
         assert running.client.get("/health", headers={"Host": "evil.example"}).status_code == 400
         assert running.client.get("/health").status_code == 200
 
 
-def test_what_was_accepted_is_answered_before_it_ends(running):
-    """The last test: it ends the service."""
+def test_accepted_requests_are_answered_before_the_service_ends(running):
+    """Keep this test the last one, because it ends the service."""
     with ThreadPoolExecutor(1) as pool:
         answer = pool.submit(post, running.client, "/view")
         while not answer.done() and not list(running.uploads.glob("stereoweave-service-*/tmp*")):

@@ -1,4 +1,4 @@
-"""Error texts and notes of the HTTP service, where a setting is named by its field of the form."""
+"""Errors and notes of the HTTP service, which name settings by their form fields."""
 
 import asyncio
 import json
@@ -13,7 +13,7 @@ from error_examples import LAYOUTS, write_error_examples
 from stereoweave.matching.matcher import Matcher
 from stereoweave.service.answers import ServiceAnswer, ServiceJob, answer_many
 
-# What Ray Serve is warned of by Pydantic when it is imported.
+# Pydantic warns about Ray Serve when that is imported.
 pytestmark = pytest.mark.filterwarnings("ignore:Using extra keyword arguments on `Field`:DeprecationWarning")
 
 PAIR = {"left": "left.png", "right": "right.png"}
@@ -68,7 +68,7 @@ NOTES: dict[str, tuple[dict[str, str], dict[str, Any]]] = {
 
 @pytest.fixture(scope="module")
 def ask(tmp_path_factory) -> Ask:
-    """Posts a form with these files and fields to a service that works in this process."""
+    """Return a function that posts a form with files and fields to a service in this process."""
     from stereoweave.service.asgi import Guard, Limits, make_app
 
     folder: Path = tmp_path_factory.mktemp("files")

@@ -22,7 +22,7 @@ def temporary(tmp_path, monkeypatch) -> Path:
     return tmp_path
 
 
-def test_uploads_of_a_killed_process_are_removed_at_the_next_start_and_those_of_a_running_one_stay():
+def test_the_next_start_removes_uploads_of_killed_processes_but_not_of_running_ones():
     command = [sys.executable, "-c", PROGRAM]
     pipe = subprocess.PIPE
     with (
@@ -39,14 +39,14 @@ def test_uploads_of_a_killed_process_are_removed_at_the_next_start_and_those_of_
         running.communicate("\n")
 
 
-def test_nothing_is_left_of_a_folder_after_its_block(temporary):
+def test_a_folder_is_removed_after_its_block(temporary):
     with make_own_folder() as folder:
         (folder / "upload").write_bytes(b"x")
         assert folder.stat().st_mode & 0o777 == 0o700
     assert not list(temporary.iterdir())
 
 
-def test_a_folder_that_a_link_of_that_name_leads_to_is_not_emptied(temporary):
+def test_a_link_named_like_an_abandoned_folder_is_not_followed(temporary):
     other = temporary / "other"
     other.mkdir()
     (other / "file").write_bytes(b"x")
@@ -56,7 +56,7 @@ def test_a_folder_that_a_link_of_that_name_leads_to_is_not_emptied(temporary):
         assert (other / "file").exists()
 
 
-def test_a_lock_file_that_was_removed_meanwhile_is_not_missed(temporary):
+def test_a_removed_lock_file_is_no_error(temporary):
     with make_own_folder() as folder:
         folder.with_name(f"{folder.name}.lock").unlink()
     assert not list(temporary.iterdir())

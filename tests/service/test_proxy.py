@@ -1,4 +1,4 @@
-"""The shipped configuration of nginx, before an application that says which requests reach it."""
+"""The shipped nginx configuration, in front of an application that records the requests that reach it."""
 
 import os
 import shutil
@@ -23,7 +23,7 @@ REACHED: list[tuple[str, str, int]] = []
 
 
 async def app(scope, receive, send) -> None:
-    """Answers everything, and keeps path, host and length of the body."""
+    """Answer every request, and record its path, its host and the length of its body."""
     if scope["type"] != "http":
         return
     length, more = 0, True
@@ -56,7 +56,7 @@ def certificate(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def port(tmp_path_factory, certificate) -> Iterator[int]:
-    """The port of nginx, whose configuration is changed in places, ports and seconds alone."""
+    """Yield the port of an nginx with the shipped configuration, except for paths, ports and one time."""
     folder = tmp_path_factory.mktemp("nginx")
     with socket.create_server(("127.0.0.1", 0)) as listener, run_http_server(app, listener, ClientTimeouts()):
         (port,) = find_free_ports(1)
@@ -79,12 +79,12 @@ def port(tmp_path_factory, certificate) -> Iterator[int]:
 
 
 def configuration(folder: Path, places: dict[str, str]) -> str:
-    """All of it, in the foreground and in a folder of its own, with what is shipped changed in places."""
+    """Return a complete configuration: the shipped one with replacements, in a separate folder."""
     shipped = CONFIGURATION.read_text()
     for there, here in places.items():
         assert there in shipped
         shipped = shipped.replace(there, here)
-    user = "user root;" if os.geteuid() == 0 else ""  # else its workers may not write into the folder
+    user = "user root;" if os.geteuid() == 0 else ""  # otherwise the workers cannot write to the folder
     kinds = ("client_body", "proxy", "fastcgi", "uwsgi", "scgi")
     paths = "".join(f"{kind}_temp_path {folder}/{kind};\n" for kind in kinds)
     return f"daemon off; {user} pid {folder}/pid; events {{}}\nhttp {{ access_log off;\n{paths}{shipped}}}\n"
@@ -108,7 +108,7 @@ def client(port, certificate) -> Iterator[httpx.Client]:
 
 
 def ask(client: httpx.Client, method: str, path: str, **options) -> httpx.Response:
-    """The response to a request for the name that the certificate has."""
+    """Send a request with the certificate's host name, and return the response."""
     return client.request(method, path, headers={"Host": NAME}, extensions={"sni_hostname": NAME}, **options)
 
 
@@ -118,24 +118,24 @@ def connect(port: int, certificate: Path, name: str = NAME) -> ssl.SSLSocket:
     return trusted.wrap_socket(connection, server_hostname=name)
 
 
-def test_a_form_reaches_the_service_whole_and_by_its_own_name(client):
+def test_a_whole_form_reaches_the_service_with_the_services_own_host_name(client):
     assert ask(client, "POST", "/disparity", content=bytes(3_000_000)).text == "done"
     path, host, length = REACHED[-1]
     assert (path, length) == ("/disparity", 3_000_000)
     assert host.startswith("127.0.0.1:")
 
 
-def test_a_body_that_is_too_large_does_not_reach_it(client):
+def test_a_body_that_is_too_large_does_not_reach_the_service(client):
     assert ask(client, "POST", "/view", content=bytes(64 * 2**20 + 1)).status_code == 413
     assert REACHED[-1][0] != "/view"
 
 
-def test_metrics_are_not_for_everyone(client):
+def test_metrics_are_not_public(client):
     assert ask(client, "GET", "/metrics").status_code == 404
     assert ask(client, "GET", "/health").status_code == 200
 
 
-def test_an_endless_head_is_refused_and_does_not_reach_it(port, certificate):
+def test_endless_headers_are_refused_and_do_not_reach_the_service(port, certificate):
     reached = len(REACHED)
     with connect(port, certificate) as connection:
         connection.sendall(f"GET /health HTTP/1.1\r\nHost: {NAME}\r\nX: ".encode())
@@ -149,7 +149,7 @@ def test_an_endless_head_is_refused_and_does_not_reach_it(port, certificate):
     "begun",
     ["GET /health HTTP/1.1\r\nX: ", f"POST /view HTTP/1.1\r\nHost: {NAME}\r\nContent-Length: 99\r\n\r\nx"],
 )
-def test_a_request_that_does_not_arrive_is_closed_and_does_not_reach_it(port, certificate, begun):
+def test_an_incomplete_request_is_closed_and_does_not_reach_the_service(port, certificate, begun):
     reached = len(REACHED)
     with connect(port, certificate) as connection:
         connection.sendall(begun.encode())
@@ -161,7 +161,7 @@ def test_a_request_that_does_not_arrive_is_closed_and_does_not_reach_it(port, ce
     assert len(REACHED) == reached
 
 
-def test_another_name_gets_no_answer(port, certificate):
+def test_a_request_for_another_host_name_gets_no_answer(port, certificate):
     with pytest.raises(ssl.SSLError):
         connect(port, certificate, "evil.example")
 

@@ -23,7 +23,7 @@ def make_job(file: str = "disparity.png", within_s: float = 60) -> TimedJob:
 
 
 def load_named_answerer() -> BatchAnswerer:
-    """Instead of a network: jobs named so sleep or crash, others get their name."""
+    """Return a stand-in for a network: the jobs "sleep" and "crash" do so, others get their name."""
 
     def answer(jobs: Sequence[ServiceJob]) -> list[ServiceAnswer | Exception]:
         for job in jobs:
@@ -39,7 +39,7 @@ def load_named_answerer() -> BatchAnswerer:
 @pytest.fixture(scope="module")
 def processes(tmp_path_factory) -> Iterator[ReplicaProcesses]:
     processes = ReplicaProcesses(load_named_answerer, tmp_path_factory.mktemp("files"))
-    processes.answer([make_job()])  # it has started: what comes now takes its own time alone
+    processes.answer([make_job()])  # wait for the start, which would take time from the tests' jobs
     yield processes
     processes.close()
 
@@ -51,26 +51,26 @@ def list_names(outcomes: Sequence[ServiceAnswer | Exception]) -> list[str]:
     ]
 
 
-def test_what_overruns_is_ended_and_what_waited_with_it_is_answered(processes):
+def test_a_job_that_misses_its_deadline_is_ended_and_the_others_are_answered(processes):
     start_s = time.monotonic()
     outcomes = processes.answer([make_job("first"), make_job("sleep", within_s=0.3), make_job("second")])
     assert list_names(outcomes) == ["first", "TimeoutError", "second"]
     assert time.monotonic() - start_s < 20
-    assert str(outcomes[1]).startswith("expected to be done within")
+    assert str(outcomes[1]).startswith("expected a result within")
 
 
-def test_what_crashes_is_one_line_and_what_waited_with_it_is_answered(processes):
+def test_a_crash_is_reported_in_one_line_and_the_other_jobs_are_answered(processes):
     outcomes = processes.answer([make_job("first"), make_job("crash"), make_job("second")])
     assert list_names(outcomes) == ["first", "ProcessDiedError", "second"]
     assert "SIGSEGV" in str(outcomes[1])
 
 
-def test_what_is_late_already_is_not_begun(processes):
+def test_a_job_past_its_deadline_is_not_started(processes):
     assert list_names(processes.answer([make_job("first", within_s=-1)])) == ["TimeoutError"]
     assert list_names(processes.answer([make_job("second")])) == ["second"]
 
 
-def test_a_match_by_a_network_is_ended_at_its_deadline_and_the_next_one_is_answered(tmp_path):
+def test_matching_is_ended_at_its_deadline_and_the_next_job_is_answered(tmp_path):
     processes = ReplicaProcesses(partial(load_answerer, Backend(threads=1)), tmp_path / "files")
     assert 0 < processes.warm_up() < 60
     assert list_names(processes.answer([make_job(within_s=0.01)])) == ["TimeoutError"]
@@ -79,7 +79,7 @@ def test_a_match_by_a_network_is_ended_at_its_deadline_and_the_next_one_is_answe
     processes.close()
 
 
-def test_pictures_are_measured_by_their_heads(processes, tmp_path):
+def test_pictures_are_measured_from_their_headers(processes, tmp_path):
     job = make_job().job
     assert processes.measure(job, left_s=10) == pytest.approx(2 * 640 * 480 / 1e6)
     (tmp_path / "text").write_text("no picture")
@@ -89,12 +89,12 @@ def test_pictures_are_measured_by_their_heads(processes, tmp_path):
         )
 
 
-def test_a_picture_whose_head_cannot_be_read_in_time_is_refused(processes):
+def test_a_picture_whose_header_cannot_be_read_in_time_is_refused(processes):
     with pytest.raises(TimeoutError):
         processes.measure(make_job().job, left_s=0)
 
 
-def test_a_network_that_cannot_be_loaded_is_said_before_any_order(tmp_path):
+def test_a_network_that_cannot_be_loaded_is_reported_before_any_job(tmp_path):
     processes = ReplicaProcesses(partial(load_answerer, Backend(model="none.onnx")), tmp_path / "files")
     with pytest.raises(MatcherError, match=r"none\.onnx: expected an ONNX matcher file"):
         processes.warm_up()

@@ -1,4 +1,4 @@
-"""The server alone: its application answers with as many bytes as the path says, at once or when allowed."""
+"""The HTTP server, with an application that answers /5 with 5 bytes at once, and /later when allowed."""
 
 import asyncio
 import socket
@@ -44,7 +44,7 @@ def connection(address) -> Iterator[socket.socket]:
 
 
 def read_to_end(connection: socket.socket) -> bytes:
-    """All that the server sends until it closes the connection, in whatever way."""
+    """Return everything that the server sends until it closes or resets the connection."""
     received = b""
     try:
         while part := connection.recv(1 << 16):
@@ -54,33 +54,33 @@ def read_to_end(connection: socket.socket) -> bytes:
     return received
 
 
-def test_a_head_without_end_is_refused_before_it_fills_memory(address, connection):
+def test_endless_headers_are_refused_before_they_fill_memory(address, connection):
     sent = 0
     connection.sendall(HEAD + b"X: ")
-    with pytest.raises(OSError):  # noqa: PT011 - the connection is closed, or reset
+    with pytest.raises(OSError):  # noqa: PT011 - the connection is closed or reset
         while sent < 50_000_000:
             sent += connection.send(b"a" * 65536)
-    assert sent < 10_000_000  # what the buffers of the system take
+    assert sent < 10_000_000  # the system's buffers accept some of it
     with socket.create_connection(address, timeout=10) as other:
         other.sendall(HEAD + b"Connection: close\r\n\r\n")
         assert read_to_end(other).startswith(b"HTTP/1.1 200")
 
 
-@pytest.mark.no_cover  # which takes time
+@pytest.mark.no_cover  # measuring coverage slows it down
 @pytest.mark.parametrize("begun", [b"", HEAD + b"X: "])
-def test_a_head_that_does_not_arrive_in_time_closes_the_connection(connection, begun):
+def test_headers_that_do_not_arrive_in_time_close_the_connection(connection, begun):
     start_s = time.monotonic()
     connection.sendall(begun)
     assert read_to_end(connection) == b""
     assert time.monotonic() - start_s < 5
 
 
-def test_the_head_of_a_second_request_is_not_waited_for_longer_than_that_of_the_first(connection):
+def test_the_headers_of_a_second_request_have_the_same_time_limit(connection):
     connection.sendall(HEAD + b"\r\n" + HEAD)
     assert read_to_end(connection).count(b"HTTP/1.1 200") == 1
 
 
-def test_a_head_in_pieces_and_requests_in_one_piece_are_answered(connection):
+def test_a_request_in_pieces_and_two_requests_in_one_piece_are_answered(connection):
     request = HEAD + b"\r\n"
     for place in range(len(request)):
         connection.sendall(request[place : place + 1])
@@ -88,46 +88,46 @@ def test_a_head_in_pieces_and_requests_in_one_piece_are_answered(connection):
     assert read_to_end(connection).count(b"HTTP/1.1 200") == 3
 
 
-def test_what_is_no_http_behind_a_response_closes_the_connection_without_an_error(connection, caplog):
+def test_invalid_http_after_a_response_closes_the_connection_without_an_error(connection, caplog):
     connection.sendall(b"POST /5 HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\n")
     answered = b""
-    while not answered.endswith(b"\r\n\r\n" + bytes(5)):  # before there is a body
+    while not answered.endswith(b"\r\n\r\n" + bytes(5)):  # the response comes before the request's body
         answered += connection.recv(1 << 16)
     connection.sendall(b"no chunk\r\n")
     assert read_to_end(connection) == b""
     assert caplog.messages == []
 
 
-def test_a_request_for_a_head_that_goes_on_as_no_http_is_closed_without_an_error(connection, caplog):
+def test_a_head_request_that_continues_with_invalid_http_is_closed_without_an_error(connection, caplog):
     ALLOWED.clear()
     connection.sendall(b"HEAD /later HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\nno chunk\r\n")
-    assert read_to_end(connection) == b""  # a response with a body would be none
+    assert read_to_end(connection) == b""  # a response to HEAD has no body
     ALLOWED.set()
     assert caplog.messages == []
 
 
-def test_a_request_that_takes_longer_than_a_head_may_take_is_answered(connection):
+def test_a_response_may_take_longer_than_the_time_limit_of_headers(connection):
     ALLOWED.clear()
     connection.sendall(b"GET /later HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n")
     threading.Timer(2 * TIMEOUTS.head_s, ALLOWED.set).start()
     assert read_to_end(connection).endswith(b"later")
 
 
-def test_a_response_that_is_not_read_in_time_is_given_up(connection):
+def test_a_response_that_is_not_read_in_time_is_aborted(connection):
     connection.sendall(b"GET /50000000 HTTP/1.1\r\nHost: x\r\n\r\n")
     connection.recv(1)
     time.sleep(4 * TIMEOUTS.reader_s)
     assert len(read_to_end(connection)) < 49_000_000
 
 
-def test_a_response_that_is_not_read_is_given_up_though_another_request_waits_behind_it(connection):
+def test_an_unread_response_is_aborted_even_if_another_request_waits_behind_it(connection):
     connection.sendall(b"GET /50000000 HTTP/1.1\r\nHost: x\r\n\r\n" * 2)
     connection.recv(1)
     time.sleep(4 * TIMEOUTS.reader_s)
     assert len(read_to_end(connection)) < 49_000_000
 
 
-def test_what_was_accepted_is_answered_before_the_server_ends():
+def test_accepted_requests_are_answered_before_the_server_ends():
     ARRIVED.clear()
     ALLOWED.clear()
     with socket.create_server(("127.0.0.1", 0)) as listener:
@@ -140,8 +140,8 @@ def test_what_was_accepted_is_answered_before_the_server_ends():
             assert read_to_end(connection).endswith(b"later")
 
 
-@pytest.mark.no_cover  # which takes time
-def test_a_body_of_tiny_chunks_does_not_hold_others_up(address, connection):
+@pytest.mark.no_cover  # measuring coverage slows it down
+def test_a_body_of_tiny_chunks_does_not_delay_other_requests(address, connection):
     connection.sendall(b"POST /5 HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\n")
     threading.Thread(target=connection.sendall, args=(b"1\r\na\r\n" * 150_000,), daemon=True).start()
     waited_s, start_s = [], time.monotonic()
@@ -153,7 +153,7 @@ def test_a_body_of_tiny_chunks_does_not_hold_others_up(address, connection):
     assert max(waited_s) < 0.7
 
 
-def test_beyond_the_limit_the_connection_that_waited_longest_is_closed_and_the_others_are_answered():
+def test_above_the_limit_only_the_connection_that_has_waited_longest_is_closed():
     with ExitStack() as opened:
         listener = opened.enter_context(socket.create_server(("127.0.0.1", 0)))
         opened.enter_context(run_http_server(app, listener, ClientTimeouts(head_s=60)))
@@ -161,7 +161,7 @@ def test_beyond_the_limit_the_connection_that_waited_longest_is_closed_and_the_o
         for count in range(1, 502):
             connection = socket.create_connection(listener.getsockname(), timeout=10)
             several.append(opened.enter_context(connection))
-            if count % 50 == 0:  # more would wait to be accepted than may
+            if count % 50 == 0:  # otherwise too many would wait to be accepted
                 assert is_answered(several[0])
         assert read_to_end(several[1]) == b""
         assert all(map(is_answered, [several[0], several[2], several[-1]]))
