@@ -1,1 +1,1 @@
-"""Depth of many pairs and videos, on this machine or on a Ray cluster."""
+"""Depth estimation for many pairs and videos, on this machine or on a Ray cluster."""

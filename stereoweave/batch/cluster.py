@@ -1,9 +1,9 @@
-"""Depth of very many pairs and videos, by workers on one or many machines, in folders or object stores.
+"""Depth estimation for very many pairs and videos, by workers on one or many machines.
 
-Parquet files store the plan and the results by chunk (`manifest`); this module distributes the chunks'
-numbers. Rerun the same command to resume after any interruption: chunks whose rows are written are only
-checked, all others are processed. On a disk a second concurrent run is refused; in an object store two
-concurrent runs do all work twice but damage nothing.
+Pictures and results are in folders or object stores. Parquet files hold the plan and the rows of each chunk
+(`manifest`); this module distributes chunk numbers to the workers. Rerun the same command to resume after any
+interruption: chunks that have rows are only checked, and all others are processed. In a folder, a second
+concurrent run is refused. In an object store, two concurrent runs do all work twice but damage nothing.
 """
 
 import json
@@ -43,10 +43,10 @@ class ClusterTally:
 
     Attributes:
         made: Number of pairs and videos processed.
-        there: Number finished before.
+        there: Number finished by earlier runs.
         failed: Number that failed.
         named: Names and errors of the first failures.
-        manifest: Path or URL of the folder of Parquet files with a row for each.
+        manifest: Path or URL of the folder of Parquet files, which hold a row for each pair or video.
     """
 
     made: int
@@ -64,21 +64,23 @@ def run_cluster(
     *,
     console: Console | None = None,
 ) -> ClusterTally:
-    """Process every pair and video in the source that has no results yet, and write a row for each.
+    """Process every unfinished pair and video in the source, and write a row for each.
 
-    Results are in destination/name: for a pair the files of `depth` for many pairs, for a video depth.mkv,
-    its disparity in 16-bit grey. All machines of a cluster must see both places under the same names.
+    Results are written to destination/name. A pair gets the files that `depth` writes for many pairs; a video
+    gets depth.mkv, its disparity in 16-bit grey. All machines of a cluster must see the source and the
+    destination under the same paths or URLs.
 
     Args:
-        source: A folder, or its URL in an object store.
-        destination: A new folder or URL, or that of an interrupted batch with the same job.
+        source: A folder, or the URL of one in an object store.
+        destination: A new folder or URL, or one that holds an interrupted batch with the same job.
         job: Settings for each pair.
-        engine: Where to run; default: this machine.
-        console: Shows progress; default: hidden.
+        engine: The cluster and its workers; default: this machine.
+        console: Console for the progress bar; default: no progress bar.
 
     Raises:
-        StereoweaveError: A place, the cluster, the model or the provider is or becomes unusable, or another
-            run writes to the destination. Results are kept, and the same call resumes.
+        StereoweaveError: The source, the destination, the cluster, the model or the provider is unusable or
+            fails, or another run is writing to the destination. Finished results are kept; repeat the call to
+            resume.
     """
     engine = engine or Engine()
     job = _adapt_job(job or DepthJob(), engine)
@@ -129,12 +131,12 @@ def _print_counts(tally: ClusterTally, destination: str) -> None:
     for name, error in tally.named:
         typer.echo(f"failed: {name}: {error}")
     if tally.failed > len(tally.named):
-        typer.echo(f"failed: {tally.failed - len(tally.named)} more, in the manifest")
+        typer.echo(f"failed: {tally.failed - len(tally.named)} more, listed in the manifest")
     typer.echo(f"manifest: {tally.manifest}")
 
 
 def _process_chunks(worker: ChunkWorker, plan: ChunkPlan, engine: Engine, console: Console) -> Counts:
-    """Process all chunks of a plan."""
+    """Process all chunks of a plan, and return their counts."""
     counts, start_s = Counts(), time.perf_counter()
     per_task = -(-len(plan.chunks) // _MOST_TASKS)
     tasks = [plan.chunks[first : first + per_task] for first in range(0, len(plan.chunks), per_task)]
@@ -149,38 +151,42 @@ def _process_chunks(worker: ChunkWorker, plan: ChunkPlan, engine: Engine, consol
 
 
 def _check_folders(worker: ChunkWorker) -> ChunkWorker:
-    """Return the worker if this machine sees both places; raises otherwise."""
+    """Return the worker; raise an error if this machine does not see the source or destination folder."""
     try:
         for store in (worker.source, worker.destination):
             if store.folder is not None:
                 store.check_source()
     except StereoweaveError as error:
         detailed = error.with_detail(
-            "all machines of a cluster need it on a shared disk, or use an object store"
+            "put it on a disk that all machines of the cluster share, or use an object store"
         )
         raise detailed.with_prefix(f"{platform.node()}: ") from error
     return worker
 
 
 def _adapt_job(job: DepthJob, engine: Engine) -> DepthJob:
-    """Return the job without default reports, and with the threads of one worker."""
+    """Return the job without the default report, and with the number of threads of one worker."""
     always = tuple(file for file in job.always if file != "report.html")
     return replace(job, always=always, backend=replace(job.backend, threads=engine.threads_each))
 
 
 def _open_store(place: str | Path) -> Store:
-    """Open a place as a store; makes paths absolute because workers have other working folders."""
+    """Open a folder or URL as a store; make paths absolute, because workers have other working folders."""
     store = store_at(place)
     return store if store.folder is None else store_at(store.folder.absolute())
 
 
 def _lock_folder(destination: Store) -> AbstractContextManager[None]:
-    """Lock a folder on a disk against a second run; object stores have no locks."""
+    """Lock the destination against a second run if it is a folder; object stores have no locks."""
     return lock_output(destination.folder) if destination.folder else nullcontext()
 
 
 def _claim(destination: Store, job: DepthJob, source: Store) -> None:
-    """Record the batch's settings in the destination; raises if it belongs to something else."""
+    """Record the batch's settings in the destination.
+
+    Raises:
+        StereoweaveError: The destination holds another batch or other files.
+    """
     facts = {"made by": "stereoweave batch", "source": source.place, **job_facts(job)}
     if destination.exists(BATCH_FILE):
         place = destination.at(BATCH_FILE)
@@ -193,9 +199,9 @@ def _claim(destination: Store, job: DepthJob, source: Store) -> None:
 
 
 def _read_job_files(job: DepthJob) -> Iterator[tuple[str, str, bytes]]:
-    """Yield kind, name and content of the job's files that workers on other machines may not see."""
+    """Yield the kind, name and content of each job file that workers on other machines may not see."""
     model, calibration = Path(job.backend.model), job.request.calibration
-    if str(model).endswith(".onnx") and model.is_file():  # otherwise a shipped model
+    if str(model).endswith(".onnx") and model.is_file():  # otherwise it is a shipped model
         with reading(model, "a model"):
             yield "model", model.name, model.read_bytes()
     if calibration and calibration.is_file():

@@ -1,4 +1,4 @@
-"""Depth of many pairs by several processes; an interrupted batch resumes.
+"""Depth estimation for many pairs by several processes; an interrupted batch can be resumed.
 
 A pair is finished once its folder has `done.json`, which is written last and records the pictures and a
 summary. `batch.json` records the settings of the whole folder.
@@ -40,13 +40,19 @@ _NUMBERS = ("disparity_min_px", "disparity_median_px", "disparity_max_px", "conf
 _COLUMNS = ("name", "pictures", "seconds", *_NUMBERS, "notes", "error")
 
 Work = Callable[[NamedPair], str | None]
-# A pair and its error, None on success.
+# A pair and its error, which is None on success.
 Outcome = tuple[NamedPair, str | None]
 
 
 @dataclass(frozen=True)
 class LocalTally:
-    """Counts of a batch: pairs processed, pairs finished before, and name and error of each failed pair."""
+    """Counts of a batch.
+
+    Attributes:
+        done: Number of pairs processed.
+        skipped: Number of pairs finished by earlier runs.
+        failed: Name and error of each failed pair.
+    """
 
     done: int
     skipped: int
@@ -61,22 +67,22 @@ def run_batch(
     processes: int | None = None,
     console: Console,
 ) -> LocalTally:
-    """Process every unfinished pair, with results in `out`/name, and write summary.csv.
+    """Process every unfinished pair, write its results to `out`/name, and write summary.csv.
 
     A pair that fails, or whose process is killed, is reported at once; the others continue. summary.csv has a
-    row for each pair in the folder, including failed pairs and those of earlier runs.
+    row for each pair in the folder, including failed pairs and pairs of earlier runs.
 
     Args:
-        pairs: The pairs.
-        out: A new folder, or that of an interrupted batch with the same job.
+        pairs: Pairs to process unless they are finished.
+        out: A new folder, or the folder of an interrupted batch with the same job.
         job: Settings for each pair.
-        processes: Number of processes; default: all cores. If more than one, each uses one thread unless the
-            job sets the number.
-        console: Shows progress and failures.
+        processes: Number of processes; default: one per core. Several processes use one thread each unless
+            the job sets the number of threads.
+        console: Console for progress and failures.
 
     Raises:
-        StereoweaveError: `out` belongs to something else, is in use or cannot be written, or the matcher is
-            unknown.
+        StereoweaveError: `out` holds another batch or other files, is in use or cannot be written, the model
+            is unknown, or the provider is unavailable.
     """
     processes = min(processes or usable_cores(), max(len(pairs), 1))
     if processes > 1 and job.backend.threads is None:
@@ -103,7 +109,8 @@ def run_batch_command(
 ) -> int:
     """Run a batch and print its counts. Returns the exit code: 1 if a pair failed, 130 after Ctrl-C.
 
-    Writes reports only if the job's files name report.html or all: a report takes as long as everything else.
+    Reports are written only if the job's files include report.html or all, because a report takes as long as
+    all other files together.
     """
     job = replace(job, always=tuple(file for file in job.always if file != "report.html"))
     for note in found.notes:
@@ -135,7 +142,7 @@ def _print_counts(tally: LocalTally, out: Path) -> None:
 def _process_pairs(
     work: Work, pairs: Sequence[NamedPair], processes: int, threads: int | None, console: Console
 ) -> list[tuple[str, str]]:
-    """Process all pairs. Shows failures at once, and returns their names and errors."""
+    """Process all pairs, show each failure at once, and return the names and errors of the failed pairs."""
     failed: list[tuple[str, str]] = []
     start_s = time.perf_counter()
     with closing(_collect_outcomes(work, pairs, processes, threads)) as outcomes, progress(console) as bar:
@@ -153,23 +160,26 @@ def _process_pairs(
 def _collect_outcomes(
     work: Work, pairs: Sequence[NamedPair], processes: int, threads: int | None
 ) -> Generator[Outcome, None, None]:
-    """Yield outcomes as they come. If a process is killed, rerun each suspect alone to find its pair."""
+    """Yield the outcome of each pair as it finishes.
+
+    After a process is killed, each pair that was in progress runs again alone, to find the one responsible.
+    """
     waiting = deque(pairs)
     while waiting:
         for pair in (yield from _process_until_killed(work, waiting, processes, threads)):
             if (yield from _process_until_killed(work, deque([pair]), 1, threads)):
-                yield pair, "its process was killed; is the memory full?"
+                yield pair, "its process was killed; did it run out of memory?"
 
 
 def _process_until_killed(
     work: Work, waiting: deque[NamedPair], processes: int, threads: int | None
 ) -> Generator[Outcome, None, list[NamedPair]]:
-    """Yield outcomes of the waiting pairs; returns the pairs in progress when a process was killed."""
+    """Yield outcomes of the waiting pairs; return the pairs that were in progress if a process was killed."""
     pending: dict[Future[str | None], NamedPair] = {}
     with _start_pool(processes, threads or usable_cores()) as pool:
         try:
             while waiting or pending:
-                # Submit one pair per process, so that few are suspects.
+                # Submit only one pair per process, so that few are in progress if one is killed.
                 while waiting and len(pending) < processes:
                     pending[pool.submit(work, waiting[0])] = waiting[0]
                     waiting.popleft()
@@ -184,9 +194,9 @@ def _process_until_killed(
 
 @contextmanager
 def _start_pool(processes: int, threads: int) -> Iterator[ProcessPoolExecutor]:
-    """Start a pool of processes; terminates them on an error."""
+    """Yield a pool of processes, and terminate them on an error."""
     others = multiprocessing.active_children()
-    # Spawned, because a forked child inherits OpenCV's and ONNX Runtime's threads in an unknown state.
+    # Spawn them, because a forked child inherits OpenCV's and ONNX Runtime's threads in an unknown state.
     context = multiprocessing.get_context("spawn")
     with (
         _limit_blas_threads(threads),
@@ -205,9 +215,10 @@ def _start_pool(processes: int, threads: int) -> Iterator[ProcessPoolExecutor]:
 
 @contextmanager
 def _limit_blas_threads(threads: int) -> Iterator[None]:
-    """Limit the threads of OpenBLAS, NumPy's matrix library, in processes started meanwhile.
+    """Limit the threads of OpenBLAS, NumPy's matrix library, in processes started within the block.
 
-    OpenBLAS reads the environment once, when it is loaded; its threads busy-wait after each product.
+    OpenBLAS reads the environment variable once, when it is loaded. Its threads busy-wait after each matrix
+    product, which would slow down the other processes.
     """
     before = os.environ.get(_BLAS_THREADS)
     os.environ[_BLAS_THREADS] = str(threads)
@@ -220,7 +231,7 @@ def _limit_blas_threads(threads: int) -> Iterator[None]:
 
 
 def _process_pair(out: Path, job: DepthJob, pair: NamedPair) -> str | None:
-    """Write a pair's results and mark it as finished. Returns the error in one line, or None."""
+    """Process a pair and mark it as finished; return its error in one line, or None on success."""
     try:
         folder, sources = out / pair.name, _describe_sources(pair)
         job = replace(job, backend=_pin(job.backend))
@@ -237,19 +248,19 @@ def _process_pair(out: Path, job: DepthJob, pair: NamedPair) -> str | None:
             temporary.write_text(json.dumps(facts | {"summary": asdict(summary)}), encoding="utf-8")
     except StereoweaveError as error:
         return " ".join(error.format(job.name_of).split())
-    except Exception as error:  # a library may raise anything on a bad picture; the other pairs continue
+    except Exception as error:  # a library may raise any error on a bad picture; the other pairs continue
         return " ".join(f"{type(error).__name__}: {error}".split())
     return None
 
 
 @functools.lru_cache(maxsize=1)
 def _pin(backend: Backend) -> PinnedBackend:
-    """Load the network once in this process of the batch, even if its file is replaced meanwhile."""
+    """Load the network once in this process, and keep it even if its file is replaced."""
     return backend.pin()
 
 
 def _describe_sources(pair: NamedPair) -> list[list[Any]]:
-    """Return name, size and modification time of each of a pair's files, to detect changes."""
+    """Return the name, size and modification time of each file of a pair, to detect changes."""
     sources = []
     for path in (*pair.pictures, *([pair.calibration] if pair.calibration else [])):
         with reading(path, "a picture"):
@@ -267,7 +278,7 @@ def _is_finished(folder: Path, pair: NamedPair) -> bool:
 
 
 def _read_done(folder: Path) -> dict[str, Any]:
-    """Read `done.json` of a pair; empty if it is not finished or files are missing."""
+    """Return the content of a pair's `done.json`, or {} if the pair is unfinished or lacks a result file."""
     try:
         facts = json.loads((folder / DONE_FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -276,7 +287,7 @@ def _read_done(folder: Path) -> dict[str, Any]:
 
 
 def _claim(out: Path, job: DepthJob) -> None:
-    """Record the batch's settings in the folder; raises if it belongs to something else."""
+    """Record the batch's settings in the folder; raise an error if it holds another batch or other files."""
     facts, path = job_facts(job), out / BATCH_FILE
     if path.exists():
         expected = "the description of a batch that stereoweave depth made"
@@ -291,7 +302,7 @@ def _claim(out: Path, job: DepthJob) -> None:
 
 
 def _remove_abandoned_files(out: Path) -> None:
-    """Remove temporary files of killed processes; call only while nothing is being written."""
+    """Remove temporary files of killed processes; call this only while no process is writing."""
     for folder in out.glob(".stereoweave-*"):
         shutil.rmtree(folder, ignore_errors=True)
     remove_leftovers(out)
@@ -308,7 +319,7 @@ def _write_summary(out: Path, pairs: Sequence[NamedPair], failed: dict[str, str]
 
 
 def _read_row(folder: Path) -> dict[str, Any]:
-    """Return the summary row of a pair; empty if it is not finished."""
+    """Return the summary row of a pair, or {} if the pair is unfinished."""
     if not (facts := _read_done(folder)):
         return {}
     row = {name: facts["summary"][name] for name in _NUMBERS}

@@ -1,7 +1,8 @@
-"""Plan and results of a large batch: Parquet files by chunk, so that no process has to read all of them.
+"""Plan and rows of a large batch, in many Parquet files: no process has to read all of them.
 
-`plan/part-*.parquet` lists the pairs and videos found, with their chunks; it is extended, never rearranged.
-Each `manifest/part-*.parquet` has the rows of one chunk and is written once the whole chunk is processed.
+The files `plan/part-*.parquet` list the pairs and videos with their chunks. The plan is extended, never
+rearranged. Each file `manifest/part-*.parquet` holds the rows of one chunk, and is written after the whole
+chunk is processed.
 """
 
 import io
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 
 MANIFEST, PLAN = "manifest", "plan"
 MOST_IN_A_CHUNK = 32
-"""Most pairs in a chunk, and so the most that are repeated after a worker dies."""
+"""Maximum number of pairs in a chunk, and thus of pairs to repeat after a worker dies."""
 _CHUNKS_PER_WORKER = 8
 _CHUNKS_PER_FILE = 64
 _PART = re.compile(r"part-(\d{8})\.parquet")
@@ -32,11 +33,11 @@ class PlanEntry:
     """A planned pair or video.
 
     Attributes:
-        name: The folder of its results.
-        files: Paths in the source: left and right, one picture of both views, or a video.
-        versions: Change if one of the files or the calibration changes.
-        calibration: Path of its own calibration, if any.
-        is_film: True for a video.
+        name: Name of the pair or video, and of its results folder.
+        files: Paths in the source: a left and a right picture, one picture of both views, or a video.
+        versions: Size and version of each file and of the calibration, to detect changes.
+        calibration: Path in the source of the pair's own calibration, if any.
+        is_film: Whether this is a video.
     """
 
     name: str
@@ -48,7 +49,7 @@ class PlanEntry:
 
 @dataclass(frozen=True)
 class ChunkPlan:
-    """The numbers of all chunks, the number of pairs and videos in them, and notes for the user."""
+    """Plan of a batch: numbers of its chunks, count of pairs and videos, and notes for the user."""
 
     chunks: tuple[int, ...]
     count: int
@@ -56,27 +57,28 @@ class ChunkPlan:
 
 
 def extend_plan(source: Store, destination: Store, workers: int) -> ChunkPlan:
-    """Update the plan in the destination to the source's current files.
+    """Update the plan in the destination to the source's current files, and return it.
 
-    New files get chunks of their own, changed files their new versions. Entries of removed files stay.
+    New pairs and videos get new chunks. Entries of changed files get the new versions. Entries of removed
+    files stay.
 
     Args:
-        source: The pairs and videos.
-        destination: Holds the plan.
+        source: Store of the pairs and videos.
+        destination: Store of the plan.
         workers: Number of workers that share the new chunks.
 
     Raises:
-        StereoweaveError: No pairs or videos found, or a store cannot be used.
+        StereoweaveError: There are no pairs or videos, or a store cannot be used.
     """
     _read_plan.cache_clear()
     versions = {file.path: f"{file.size_bytes} {file.version}" for file in source.files()}
     listed = find_pairs_among(source.place, versions)
     found = {entry.name: entry for entry in _make_entries(listed.pairs, listed.films, versions)}
     parts = _list_parts(destination, PLAN)
-    # Shrinks `found` to the new ones.
+    # This removes all planned entries from `found`; the new ones remain.
     counts = {part: _update_part(destination, part, found) for part in parts}
     if not (found or counts):
-        raise StereoweaveError(f"{source.place}: expected pairs of pictures or videos in it, found none")
+        raise StereoweaveError(f"{source.place}: expected pairs of pictures or videos, found none")
     size = max(1, min(MOST_IN_A_CHUNK, len(found) // (_CHUNKS_PER_WORKER * workers)))
     chunks = list(_split_into_chunks(found.values(), size))
     for part, first in enumerate(range(0, len(chunks), _CHUNKS_PER_FILE), max(parts, default=-1) + 1):
@@ -84,7 +86,7 @@ def extend_plan(source: Store, destination: Store, workers: int) -> ChunkPlan:
     numbers = tuple(
         part * _CHUNKS_PER_FILE + chunk for part, sizes in counts.items() for chunk in range(len(sizes))
     )
-    # Rows of a lost plan, or of one that two runs extended at the same time.
+    # Remove rows of chunks that are not planned: a plan was lost, or two runs extended it at the same time.
     for stray in set(_list_parts(destination, MANIFEST)).difference(numbers):
         destination.remove(_part_path(MANIFEST, stray))
     return ChunkPlan(numbers, sum(map(sum, counts.values())), note_left_out(source.place, listed.left_out))
@@ -97,7 +99,7 @@ def read_chunk(destination: Store, chunk: int) -> list[PlanEntry]:
 
 
 def read_rows(destination: Store, chunk: int) -> dict[str, dict[str, Any]]:
-    """Read the rows of a chunk, by pair; empty if not written yet."""
+    """Return the rows of a chunk by pair name, or {} if they are not written yet."""
     path = _part_path(MANIFEST, chunk)
     if not destination.exists(path):
         return {}
@@ -154,12 +156,12 @@ def _make_entries(
     for listed, is_film in [(pairs, False), (films, True)]:
         for name, files, calibration in listed:
             paths = (*files, calibration) if calibration else files
-            file_versions = tuple(versions.get(path, "") for path in paths)  # one of a pair may be missing
+            file_versions = tuple(versions.get(path, "") for path in paths)  # a file may be missing
             yield PlanEntry(name, files, file_versions, calibration, is_film)
 
 
 def _split_into_chunks(entries: Collection[PlanEntry], size: int) -> Iterator[list[PlanEntry]]:
-    """Split into chunks of `size` pairs; a video, as slow as many pairs, gets its own chunk."""
+    """Yield chunks of `size` pairs, then a chunk for each video, which takes as long as many pairs."""
     pairs = (entry for entry in entries if not entry.is_film)
     while chunk := list(islice(pairs, size)):
         yield chunk
@@ -167,7 +169,7 @@ def _split_into_chunks(entries: Collection[PlanEntry], size: int) -> Iterator[li
 
 
 def _update_part(destination: Store, part: int, found: dict[str, PlanEntry]) -> list[int]:
-    """Update a plan file from `found`, which loses these entries. Returns the chunks' sizes."""
+    """Update the entries of a plan file from `found`, remove them from it, and return the chunks' sizes."""
     chunks = _read_plan(destination.place, part)
     updated = [[found.pop(entry.name, entry) for entry in chunk] for chunk in chunks]
     if updated != chunks:
@@ -176,16 +178,16 @@ def _update_part(destination: Store, part: int, found: dict[str, PlanEntry]) -> 
 
 
 def _write_plan(destination: Store, part: int, chunks: Sequence[Sequence[PlanEntry]]) -> list[int]:
-    """Write a plan file. Returns the chunks' sizes."""
+    """Write a plan file, and return the chunks' sizes."""
     rows = [{"chunk": number, **asdict(entry)} for number, chunk in enumerate(chunks) for entry in chunk]
     _write_table(destination, _part_path(PLAN, part), rows, _make_plan_schema())
     return [len(chunk) for chunk in chunks]
 
 
-# Caches one file, because a worker's chunks are mostly consecutive.
+# Caching one file is enough, because a worker's chunks are mostly consecutive.
 @lru_cache(maxsize=1)
 def _read_plan(destination: str, part: int) -> list[list[PlanEntry]]:
-    """Read a plan file: the entries of each chunk."""
+    """Read a plan file, and return the entries of each of its chunks."""
     chunks: list[list[PlanEntry]] = []
     for row in _read_table(store_at(destination), _part_path(PLAN, part)):
         number = row.pop("chunk")
@@ -213,8 +215,8 @@ def _read_table(destination: Store, path: str) -> list[dict[str, Any]]:
         return parquet.ParquetFile(io.BytesIO(content)).read(use_threads=False).to_pylist()
     except (pyarrow.ArrowException, ValueError) as error:
         raise FormatError(
-            f"{destination.at(path)}: expected a Parquet file of a batch, found one that cannot be read "
-            f"({error}); remove it and rerun the same command, which writes it again"
+            f"{destination.at(path)}: expected a readable Parquet file, found a damaged one "
+            f"({error}); remove it and rerun the same command to write it again"
         ) from error
 
 
@@ -229,6 +231,6 @@ def _write_table(
         parquet.write_table(pyarrow.Table.from_pylist(rows, schema=schema), content)
     except UnicodeEncodeError as error:
         raise StereoweaveError(
-            f"{destination.place}: expected files with names in UTF-8, found {error.object!r}; rename it"
+            f"{destination.place}: expected file names in UTF-8, found {error.object!r}; rename the file"
         ) from error
     destination.write_bytes(path, content.getvalue())

@@ -1,8 +1,8 @@
-"""One worker of a large batch: processes the pairs of a chunk, then writes their rows.
+"""Worker of a large batch: processes the pairs of a chunk, then writes their rows.
 
-A chunk is marked as begun in the meantime. A mark found at the start was left by a killed worker, and one of
-its pairs may be the cause. The chunk's pairs are then processed in a child process, which may be killed in
-the worker's place.
+A chunk in progress is marked in the destination. A mark that already exists was left by a killed worker, and
+one of the chunk's pairs may have been the cause. The pairs are then processed in a child process, which can
+be killed without ending the worker.
 """
 
 import errno
@@ -38,19 +38,26 @@ ManifestRow = dict[str, Any]
 BEGUN = "begun"
 FILM = "depth.mkv"
 _NAMED_FAILURES = 5
-# A process may also be killed because others need memory.
+# The pair is not always at fault: a process may also be killed because others need memory.
 _MOST_TRIES = 3
-# Consecutive processes that may be killed during startup before it is an error.
+# An error is raised after this many consecutive processes are killed during startup.
 _MOST_FALSE_STARTS = 10
-_KILLED_ERROR = "its process was killed every time; is the memory full?"
-# Younger files may belong to a running worker.
+_KILLED_ERROR = "its process was killed on every attempt; did it run out of memory?"
+# Newer files may belong to a running worker.
 _ABANDONED_AFTER_S = 600
 _DISK_ERRNOS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.ESTALE}
 
 
 @dataclass(frozen=True)
 class Counts:
-    """Numbers of pairs and videos processed, finished before and failed; `named` has the first failures."""
+    """Counts of pairs and videos by outcome.
+
+    Attributes:
+        made: Number processed.
+        there: Number finished by earlier runs.
+        failed: Number that failed.
+        named: Names and errors of the first failures.
+    """
 
     made: int = 0
     there: int = 0
@@ -63,7 +70,7 @@ class Counts:
 
     @property
     def all(self) -> int:
-        """Sum of all three."""
+        """The total number of pairs and videos."""
         return self.made + self.there + self.failed
 
 
@@ -72,11 +79,11 @@ class ChunkWorker:
     """Processes planned pairs and videos.
 
     Attributes:
-        source: The pictures and videos.
-        destination: Holds plan, rows and results.
+        source: Store of the pictures and videos.
+        destination: Store of the plan, the rows and the results.
         job: Settings for each pair.
-        job_files: The job's files that only the driver may have: kind (`model` or `calibration`), name and
-            content.
+        job_files: Kind (`model` or `calibration`), name and content of each job file that may exist only on
+            the driver's machine.
     """
 
     source: Store
@@ -85,11 +92,11 @@ class ChunkWorker:
     job_files: tuple[tuple[str, str, bytes], ...] = ()
 
     def __call__(self, chunks: Sequence[int]) -> Counts:
-        """Process the missing pairs of several chunks."""
+        """Process the unfinished pairs of several chunks, and return the counts of all their pairs."""
         return sum(map(self.make_chunk, chunks), Counts())
 
     def make_chunk(self, chunk: int) -> Counts:
-        """Process a chunk's missing, failed and changed pairs, and write its rows."""
+        """Process the missing, failed and changed pairs of a chunk, write its rows, and return its counts."""
         entries, rows = read_chunk(self.destination, chunk), read_rows(self.destination, chunk)
         missing = [entry for entry in entries if not self._is_done(entry, rows.get(entry.name))]
         mark = f"{BEGUN}/{chunk:08d}.json"
@@ -106,7 +113,7 @@ class ChunkWorker:
         return row is not None and not row["error"] and self._is_current(entry, row)
 
     def _is_current(self, entry: PlanEntry, row: ManifestRow) -> bool:
-        """Test whether a row matches the current files and its results exist."""
+        """Return whether a row was made from the current files and all its results exist."""
         if tuple(row["versions"]) != entry.versions:
             return False
         folder = entry.name
@@ -114,7 +121,7 @@ class ChunkWorker:
         return there.issuperset(row["files"])
 
     def _make_rows(self, missing: Sequence[PlanEntry], mark: str) -> list[ManifestRow]:
-        """Make the rows, in a child process if a worker was killed before."""
+        """Process pairs and return their rows; use a child process if an earlier worker was killed."""
         if not missing:
             return []
         if self.destination.exists(mark):
@@ -123,7 +130,7 @@ class ChunkWorker:
         return [self.make_row(entry) for entry in missing]
 
     def _make_rows_in_child(self, missing: Sequence[PlanEntry], mark: str) -> list[ManifestRow]:
-        """Make the rows in a child process; records the tries of each pair and limits them."""
+        """Process pairs in a child process, with a limited number of attempts each, and return their rows."""
         marked = self._read_mark(mark)
         tries, rows = marked.get("tries", {}), {row["pair"]: row for row in marked.get("rows", [])}
         with _RowProcess(self) as child:
@@ -143,14 +150,14 @@ class ChunkWorker:
     def _read_mark(self, mark: str) -> dict[str, Any]:
         try:
             return json.loads(self.destination.read_bytes(mark))
-        except ValueError:  # another run has just finished the chunk, or a power failure lost the file
+        except ValueError:  # another run has just removed the mark, or a power failure damaged it
             return {}
 
     def make_row(self, entry: PlanEntry) -> ManifestRow:
-        """Process a pair or video and return its row; the pair's own errors go into the row.
+        """Process a pair or video and return its row. An error of this pair alone is recorded in the row.
 
         Raises:
-            StereoweaveError: The source, the destination or the provider fails.
+            StereoweaveError: The source, the destination or the provider has failed for all pairs.
         """
         start_s = time.perf_counter()
         row, job = self._make_empty_row(entry), self._loaded_job
@@ -162,7 +169,7 @@ class ChunkWorker:
                     row |= self._process_pair(entry, Path(name), job)
             except _StoreError:
                 raise
-            except Exception as error:  # a library may raise anything on a bad picture; the others continue
+            except Exception as error:  # a library may raise any error on a bad picture; the others continue
                 self._check_disk(error)
                 if any(isinstance(cause, ProviderError) for cause in _list_causes(error)):
                     _check_provider(job.backend.matcher())
@@ -229,14 +236,14 @@ class ChunkWorker:
                 kept = ProviderError | OutputInUseError
                 if not was_begun or any(isinstance(cause, kept) for cause in _list_causes(error)):
                     raise
-                # Parts of a killed worker, damaged or from other files.
+                # A killed worker left these parts: they are damaged, or were made from other files.
                 shutil.rmtree(begun, ignore_errors=True)
                 tally = make()
         width, height = video.size_px
         return {"width_px": width, "height_px": height, "checks": tally.named, "files": _list_names(out)}
 
     def _fetch(self, entry: PlanEntry, into: Path) -> tuple[tuple[Path, ...], Path | None]:
-        """Copy the files and the calibration to this machine."""
+        """Copy the files and the calibration to this machine, and return their paths."""
         try:
             files = tuple(self.source.fetch(file, into) for file in entry.files)
             return files, self.source.fetch(entry.calibration, into) if entry.calibration else None
@@ -247,7 +254,7 @@ class ChunkWorker:
 
     @contextmanager
     def _open_results(self, entry: PlanEntry, scratch: Path) -> Iterator[Path]:
-        """Give a folder for the results, and upload them to the destination if that is not a folder."""
+        """Yield a folder for the results; afterwards upload them if the destination is an object store."""
         if self.destination.folder is not None:
             folder = self.destination.folder / entry.name
             remove_abandoned(folder)
@@ -265,13 +272,16 @@ class ChunkWorker:
                 self.destination.remove(stale)
 
     def _check_disk(self, error: Exception) -> None:
-        """Raise if a disk is full or gone, because all further pairs would fail too."""
+        """Raise an error if a disk is full or gone, because all further pairs would fail too."""
         if any(isinstance(cause, OSError) and cause.errno in _DISK_ERRNOS for cause in _list_causes(error)):
             raise _StoreError.from_error(error).with_prefix(f"{self.destination.place}: ") from error
 
     @functools.cached_property
     def _loaded_job(self) -> DepthJob:
-        """The job with its files and its network on this machine, even if the network's file is replaced."""
+        """The job with local copies of its files and with its network loaded.
+
+        If the model file is replaced later, the loaded network stays in use.
+        """
         job = self.job
         for kind, name, content in self.job_files:
             path = _write_job_file(name, content)
@@ -282,12 +292,12 @@ class ChunkWorker:
         return replace(job, backend=job.backend.pin())
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out the loaded job: networks cannot be pickled."""
+        """Return the state without the loaded job, because networks cannot be pickled."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
 class _StoreError(StereoweaveError):
-    """Failure of the source or destination as a whole."""
+    """Error for a source or destination that fails as a whole."""
 
 
 @contextmanager
@@ -299,7 +309,7 @@ def _convert_store_errors() -> Iterator[None]:
 
 
 class _RowProcess:
-    """A child process that makes rows; restarted after it is killed."""
+    """A child process that processes pairs, and is restarted whenever it is killed."""
 
     def __init__(self, worker: ChunkWorker) -> None:
         self._worker = worker
@@ -313,7 +323,7 @@ class _RowProcess:
             self._pool.shutdown()
 
     def start(self) -> None:
-        """Start the process unless it runs, and wait for it."""
+        """Start the process unless it is running, and wait until it has loaded the network."""
         false_starts = 0
         while self._pool is None:
             threads = self._worker.job.backend.threads or 1
@@ -325,15 +335,15 @@ class _RowProcess:
                 false_starts += 1
                 if false_starts == _MOST_FALSE_STARTS:
                     raise StereoweaveError(
-                        f"{platform.node()}: expected a process that loads the network, found it killed "
-                        f"{false_starts} times in a row; is the memory full?"
+                        f"{platform.node()}: the child process was killed {false_starts} times in a row "
+                        "while it loaded the network; did it run out of memory?"
                     ) from error
             finally:
                 if self._pool is None:
                     pool.shutdown()
 
     def make_row(self, entry: PlanEntry) -> ManifestRow | None:
-        """Process a pair or video in the child process; None if that was killed."""
+        """Process a pair or video in the child process; return its row, or None if the process was killed."""
         assert self._pool is not None
         try:
             return self._pool.submit(_make_row_in_child, entry).result()
@@ -343,26 +353,29 @@ class _RowProcess:
             return None
 
 
-# The worker of a child process.
+# The worker that this child process runs.
 _child_worker: ChunkWorker | None = None
 
 
 def _load_worker(worker: ChunkWorker) -> None:
-    """Keep a worker in this child process, and load its network before the first pair's attempt."""
+    """Store a worker in this child process, and load its network before an attempt at a pair is counted."""
     global _child_worker
     _child_worker = worker
-    worker._loaded_job  # noqa: B018 - loads it
+    worker._loaded_job  # noqa: B018 - loads the network
 
 
 def _make_row_in_child(entry: PlanEntry) -> ManifestRow:
-    """Process a pair or video with the worker of this child process."""
+    """Process a pair or video with this child process's worker, and return its row."""
     assert _child_worker is not None
     return _child_worker.make_row(entry)
 
 
 @functools.cache
 def _write_job_file(name: str, content: bytes) -> Path:
-    """Write a file of the driver to this machine's disk, for the lifetime of the process."""
+    """Write a file sent by the driver to this machine's disk, and return its path.
+
+    The file is removed when this process ends.
+    """
     path = Path(_make_scratch_folder().name, name)
     path.write_bytes(content)
     return path
@@ -386,13 +399,13 @@ def remove_abandoned(folder: Path) -> None:
 
 
 def _check_provider(matcher: Matcher) -> None:
-    """Raise if the provider fails even on the smallest pair: then the last pair was not too large."""
+    """Raise an error if the provider fails even on the smallest pair, which cannot be too large for it."""
     plain = np.zeros((SMALLEST_SIDE_PX, SMALLEST_SIDE_PX, 3), np.uint8)
     matcher.estimate(plain, plain)
 
 
 def _list_causes(error: BaseException | None) -> Iterator[BaseException]:
-    """Yield an error and the chain of its causes."""
+    """Yield an error, then its chain of causes."""
     while error is not None:
         yield error
         error = error.__cause__

@@ -1,4 +1,4 @@
-"""Large batches on a real Ray: what is made, what a bad pair or a killed process costs, and going on."""
+"""Large batches on a real Ray: results, bad pairs, killed processes, and resumption."""
 
 import errno
 import json
@@ -49,7 +49,7 @@ def engine(ray_address):
 
 
 def write_pairs(folder: Path, names, size_px=(64, 48)) -> Path:
-    """Small pairs, each another part of the example."""
+    """Write small pairs, each a different crop of the example, and return their folder."""
     width, height = size_px
     for side in ("left", "right"):
         image = read_image(TEXTURED / f"{side}.png")
@@ -64,7 +64,7 @@ def number_names(count: int) -> list[str]:
 
 
 def read_manifest(out: str | Path) -> dict[str, dict]:
-    """The rows of all parts, read as others would, each pair once."""
+    """Return the rows of all parts by pair, read by PyArrow alone; check that each pair occurs once."""
     files, path = fsspec.url_to_fs(str(out))
     rows = pyarrow.dataset.dataset(f"{path}/manifest", filesystem=files).to_table().to_pylist()
     assert len({row["pair"] for row in rows}) == len(rows)
@@ -75,7 +75,7 @@ def read_write_times_ns(out: Path) -> dict[str, int]:
     return {path.parent.name: path.stat().st_mtime_ns for path in out.glob("*/disparity.pfm")}
 
 
-def test_bad_pairs_become_rows_and_the_next_run_makes_what_is_missing_changed_or_new(engine, tmp_path):
+def test_bad_pairs_become_rows_and_the_next_run_processes_missing_changed_and_new_pairs(engine, tmp_path):
     source, out = write_pairs(tmp_path / "pairs", number_names(8)), tmp_path / "out"
     write_image(source / "left" / "alone.png", read_image(source / "left" / "00.png"))
     bad, odd = source / "right" / "01.png", source / "right" / "02.png"
@@ -120,7 +120,7 @@ def test_bad_pairs_become_rows_and_the_next_run_makes_what_is_missing_changed_or
     assert not list((out / "begun").iterdir())
 
 
-def test_killed_workers_and_a_killed_driver_lose_nothing_and_double_nothing(ray_address, engine, tmp_path):
+def test_no_pair_is_lost_or_duplicated_when_workers_and_the_driver_are_killed(ray_address, engine, tmp_path):
     names = number_names(40)
     source, out = write_pairs(tmp_path / "pairs", names, (256, 192)), tmp_path / "out"
     program = "import sys; from stereoweave.cli.root import main; sys.exit(main())"
@@ -169,7 +169,7 @@ def read_command(process: int) -> bytes:
 
 
 class KilledByPair(ChunkWorker):
-    """A worker whose process is killed by the pair 01."""
+    """A worker whose process is killed by pair 01."""
 
     def make_row(self, entry):
         if entry.name == "01":
@@ -177,25 +177,25 @@ class KilledByPair(ChunkWorker):
         return super().make_row(entry)
 
 
-def test_a_pair_that_kills_its_process_becomes_a_row_and_costs_no_other(tmp_path, monkeypatch):
+def test_a_pair_that_kills_its_process_becomes_a_row_and_affects_no_other_pair(tmp_path, monkeypatch):
     monkeypatch.setattr(cluster_worker, "_MOST_TRIES", 2)
     source, out = store_at(write_pairs(tmp_path / "pairs", number_names(3))), store_at(tmp_path / "out")
     monkeypatch.setattr("stereoweave.batch.manifest._CHUNKS_PER_WORKER", 1)
     [first] = extend_plan(source, out, workers=1).chunks
-    out.write_bytes(f"begun/{first:08d}.json", b"{}")  # as the worker leaves it that is killed with the pair
+    out.write_bytes(f"begun/{first:08d}.json", b"{}")  # left by a worker that the pair killed
     counts = KilledByPair(source, out, JOB)([first])
     assert (counts.made, counts.failed) == (2, 1)
     rows = read_rows(out, first)
     assert [row["error"] for row in rows.values()] == [
         None,
-        "its process was killed every time; is the memory full?",
+        "its process was killed on every attempt; did it run out of memory?",
         None,
     ]
     assert not out.exists(f"begun/{first:08d}.json")
 
 
 class KilledAtStart(ChunkWorker):
-    """A worker of which every further process is killed while it starts."""
+    """A worker whose child processes are all killed while they start."""
 
     @property
     def _loaded_job(self):
@@ -203,7 +203,7 @@ class KilledAtStart(ChunkWorker):
 
 
 class OutOfMemory(ChunkWorker):
-    """A worker whose provider has no memory for the pair 01."""
+    """A worker whose provider runs out of memory on pair 01."""
 
     def _process_pair(self, entry, *more):
         if entry.name == "01":
@@ -213,40 +213,40 @@ class OutOfMemory(ChunkWorker):
 
 @pytest.fixture
 def stores_and_chunk(tmp_path, monkeypatch):
-    """Source and destination of a chunk of three pairs, and its number."""
+    """Return the source and destination of a chunk of three pairs, and the chunk's number."""
     monkeypatch.setattr("stereoweave.batch.manifest._CHUNKS_PER_WORKER", 1)
     source, out = store_at(write_pairs(tmp_path / "pairs", number_names(3))), store_at(tmp_path / "out")
     [chunk] = extend_plan(source, out, workers=1).chunks
     return source, out, chunk
 
 
-def test_rows_that_a_killed_worker_noted_count_while_their_results_are_there(stores_and_chunk):
+def test_rows_saved_by_a_killed_worker_are_kept_if_their_results_exist(stores_and_chunk):
     source, out, chunk = stores_and_chunk
     worker = ChunkWorker(source, out, JOB)
     entry = read_chunk(out, chunk)
     rows = [worker._make_empty_row(one) | {"checks": ["noted"]} for one in entry[:2]]
-    rows[0]["files"] = ["disparity.pfm"]  # which is not there
+    rows[0]["files"] = ["disparity.pfm"]  # which does not exist
     mark = f"begun/{chunk:08d}.json"
     out.write_bytes(mark, json.dumps({"rows": rows}).encode())
     assert worker([chunk]).made == 3
     assert [row["checks"] == ["noted"] for row in read_rows(out, chunk).values()] == [False, True, False]
-    out.write_bytes(mark, b"")  # lost with a machine's power
+    out.write_bytes(mark, b"")  # emptied by a power failure
     assert worker._read_mark(mark) == {}
-    out.remove(mark)  # by another run, which has just made the chunk
+    out.remove(mark)  # by another run that has just finished the chunk
     assert worker._read_mark(mark) == {}
 
 
-def test_processes_that_are_killed_while_they_start_end_the_run(stores_and_chunk, monkeypatch):
+def test_the_run_fails_if_child_processes_are_killed_while_they_start(stores_and_chunk, monkeypatch):
     monkeypatch.setattr(cluster_worker, "_MOST_FALSE_STARTS", 2)
     source, out, chunk = stores_and_chunk
     out.write_bytes(f"begun/{chunk:08d}.json", b"{}")
     with pytest.raises(
-        StereoweaveError, match="loads the network, found it killed 2 times in a row; is the mem"
+        StereoweaveError, match="was killed 2 times in a row while it loaded the network; did it run out"
     ):
         KilledAtStart(source, out, JOB)([chunk])
 
 
-def test_a_pair_that_is_too_much_for_the_provider_is_a_row_and_one_that_fails_always_ends_the_run(
+def test_a_pair_too_large_for_the_provider_becomes_a_row_but_a_broken_provider_ends_the_run(
     stores_and_chunk, monkeypatch
 ):
     source, out, chunk = stores_and_chunk
@@ -267,7 +267,7 @@ def raise_provider_error(*_: object, **__: object) -> None:
     raise ProviderError("provider cpu: expected to run small.onnx, found that it failed: lost")
 
 
-def test_a_provider_that_a_workers_machine_has_not_ends_the_run_and_is_no_row(stores_and_chunk):
+def test_a_provider_missing_on_a_workers_machine_ends_the_run_without_a_row(stores_and_chunk):
     source, out, chunk = stores_and_chunk
     with pytest.raises(MatcherError, match="provider directml: expected an ONNX Runtime that includes it"):
         ChunkWorker(source, out, replace(JOB, backend=Backend(provider="directml")))([chunk])
@@ -284,9 +284,7 @@ class ModelRemover(ChunkWorker):
 
 
 @pytest.mark.parametrize("in_child_process", [False, True])
-def test_a_model_that_is_replaced_during_a_batch_is_not_taken_up(
-    stores_and_chunk, tmp_path, in_child_process
-):
+def test_a_model_file_replaced_during_a_batch_is_not_loaded(stores_and_chunk, tmp_path, in_child_process):
     source, out, chunk = stores_and_chunk
     model = Path(shutil.copy(model_file("small"), tmp_path / "model.onnx"))
     if in_child_process:
@@ -308,7 +306,7 @@ def test_a_machine_that_does_not_see_a_folder_is_named(stores_and_chunk, tmp_pat
     assert _check_folders(worker) is worker
     for places_there in ((store_at(tmp_path / "none"), out), (source, store_at(tmp_path / "none"))):
         with pytest.raises(
-            StereoweaveError, match="none: expected a folder, found no such folder; all"
+            StereoweaveError, match="none: expected a folder, found no such folder; put"
         ) as caught:
             _check_folders(ChunkWorker(*places_there, JOB))
         assert str(caught.value).startswith(f"{platform.node()}: ")
@@ -323,7 +321,7 @@ def raise_gone(*_: object) -> None:
     raise GONE
 
 
-def test_an_error_of_a_whole_store_keeps_its_setting_and_remedy(stores_and_chunk, monkeypatch):
+def test_a_store_error_keeps_its_setting_and_remedy(stores_and_chunk, monkeypatch):
     source, out, chunk = stores_and_chunk
     monkeypatch.setattr(type(source), "fetch", raise_gone)
     monkeypatch.setattr(type(source), "check_source", raise_gone)
@@ -333,12 +331,12 @@ def test_an_error_of_a_whole_store_keeps_its_setting_and_remedy(stores_and_chunk
     with pytest.raises(StereoweaveError) as caught:
         _check_folders(ChunkWorker(source, out, JOB))
     assert caught.value.format(str.upper) == (
-        f"SOURCE: {platform.node()}: expected a store, found none; all machines of a cluster need it on a "
-        "shared disk, or use an object store; mount it (WORKERS)"
+        f"SOURCE: {platform.node()}: expected a store, found none; put it on a disk that all machines of the "
+        "cluster share, or use an object store; mount it (WORKERS)"
     )
 
 
-def test_an_error_of_a_full_disk_keeps_its_setting_and_remedy(stores_and_chunk):
+def test_a_full_disk_error_keeps_its_setting_and_remedy(stores_and_chunk):
     source, out, _ = stores_and_chunk
     full = StereoweaveError(GONE.message, setting=GONE.setting, remedy=GONE.remedy)
     full.__cause__ = OSError(errno.ENOSPC, "full")
@@ -351,7 +349,7 @@ def test_an_error_of_a_full_disk_keeps_its_setting_and_remedy(stores_and_chunk):
         ChunkWorker(source, out, JOB)._check_disk(OSError(errno.ENOSPC, "full"))
 
 
-def test_a_film_goes_on_without_the_parts_of_another(tmp_path):
+def test_a_video_is_processed_after_parts_of_another_video_are_removed(tmp_path):
     (tmp_path / "films").mkdir()
     write_side_by_side(tmp_path / "films" / "sea.mkv", example_pairs(3))
     source, out = store_at(tmp_path / "films"), store_at(tmp_path / "out")
@@ -368,7 +366,7 @@ def test_a_film_goes_on_without_the_parts_of_another(tmp_path):
     assert not parts.exists()
 
 
-def test_a_film_that_another_process_makes_is_a_row_with_an_error_and_keeps_its_parts(tmp_path):
+def test_a_video_in_use_by_another_process_becomes_an_error_row_and_keeps_its_parts(tmp_path):
     (tmp_path / "films").mkdir()
     write_side_by_side(tmp_path / "films" / "sea.mkv", example_pairs(3))
     source, out = store_at(tmp_path / "films"), store_at(tmp_path / "out")
@@ -383,7 +381,7 @@ def test_a_film_that_another_process_makes_is_a_row_with_an_error_and_keeps_its_
     assert [path.name for path in parts_folder(film).iterdir()] == ["000001.nut"]
 
 
-def test_what_killed_workers_left_is_removed_after_a_while(tmp_path):
+def test_old_temporary_files_of_killed_workers_are_removed(tmp_path):
     for age_s in (0, 3600):
         for name in (f".stereoweave-{age_s:08d}", f".part-{age_s:08d}.parquet", f".mine-{age_s}"):
             path = tmp_path / name
@@ -394,7 +392,7 @@ def test_what_killed_workers_left_is_removed_after_a_while(tmp_path):
     assert left == {".stereoweave-00000000", ".part-00000000.parquet", ".mine-0", ".mine-3600"}
 
 
-def test_a_file_beside_that_is_called_like_a_network_is_none(tmp_path, monkeypatch):
+def test_a_local_file_named_like_a_shipped_network_is_not_sent_to_workers(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("small").write_bytes(b"something else")
     assert list(_read_job_files(DepthJob())) == []
@@ -404,11 +402,11 @@ def test_a_name_that_is_not_utf8_is_refused(tmp_path):
     for side in ("left", "right"):
         (tmp_path / side).mkdir()
         Path(os.fsdecode(os.fsencode(tmp_path / side) + b"/\xff.png")).touch()
-    with pytest.raises(StereoweaveError, match=r"names in UTF-8, found '.*\\udcff.*'; rename it"):
+    with pytest.raises(StereoweaveError, match=r"names in UTF-8, found '.*\\udcff.*'; rename the file"):
         extend_plan(store_at(tmp_path), store_at(tmp_path / "out"), workers=1)
 
 
-def test_another_runs_destination_is_refused_and_so_is_a_source_with_nothing_in_it(engine, tmp_path):
+def test_another_runs_destination_and_an_empty_source_are_refused(engine, tmp_path):
     source, out = write_pairs(tmp_path / "pairs", ["00"]), tmp_path / "out"
     assert run_cluster(source, out, JOB, engine).made == 1
     with pytest.raises(StereoweaveError, match=r"batch.json: expected always = .*, found .* another folder"):
@@ -421,13 +419,11 @@ def test_another_runs_destination_is_refused_and_so_is_a_source_with_nothing_in_
     with pytest.raises(StereoweaveError, match="none: expected a folder, found no such folder"):
         run_cluster(tmp_path / "none", tmp_path / "new", JOB, engine)
     (tmp_path / "empty").mkdir()
-    with pytest.raises(StereoweaveError, match="expected pairs of pictures or videos in it, found none"):
+    with pytest.raises(StereoweaveError, match="expected pairs of pictures or videos, found none"):
         run_cluster(tmp_path / "empty", tmp_path / "new", JOB, engine)
 
 
-def test_pairs_go_from_a_bucket_to_a_bucket_with_a_calibration_and_a_bad_one_is_named_by_its_url(
-    engine, bucket, tmp_path
-):
+def test_a_batch_runs_from_bucket_to_bucket_and_names_a_bad_pair_by_its_url(engine, bucket, tmp_path):
     local = write_pairs(tmp_path / "pairs", number_names(3))
     (local / "right" / "02.png").write_bytes(b"none")
     store = store_at(f"{bucket}/in")
@@ -451,7 +447,7 @@ def test_pairs_go_from_a_bucket_to_a_bucket_with_a_calibration_and_a_bad_one_is_
         run_cluster("s3://nobodys/in", f"{bucket}/new", JOB, engine)
 
 
-def test_the_command_tells_how_it_went(engine, tmp_path, capsys):
+def test_the_command_prints_counts_failures_and_the_manifest(engine, tmp_path, capsys):
     source, out = write_pairs(tmp_path / "pairs", number_names(2)), tmp_path / "out"
     (source / "left" / "01.png").write_bytes(b"none")
     assert main(["batch", str(source), str(out), "--workers", "1"]) == 1

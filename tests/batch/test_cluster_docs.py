@@ -1,4 +1,4 @@
-"""docs/cluster.md and the files that it shows: they parse, and agree with each other and with the rates."""
+"""docs/cluster.md and its example files: they parse, and agree with each other and the measured rates."""
 
 import csv
 import json
@@ -21,9 +21,9 @@ PAGE = (REPOSITORY / "docs" / "cluster.md").read_text(encoding="utf-8")
 RATES = list(csv.DictReader((REPOSITORY / "results" / "cluster.csv").read_text().splitlines()))
 MODELS, SIZES = ("small", "base"), ("320x240", "640x480", "1280x720")
 PLANS = {"1 million": 10**6, "100 million": 10**8, "10 billion": 10**10}
-# Of a plain loop's throughput, what is kept at least.
+# The least share of a plain loop's throughput that a cluster keeps.
 KEPT = 0.85
-FILES_OF_A_PAIR = 5  # where no camera is known
+FILES_OF_A_PAIR = 5  # if no camera is known
 # Fields of ray.io/v1 as KubeRay 1.6 documents them.
 JOB_FIELDS = {
     *("activeDeadlineSeconds", "backoffLimit", "clusterSelector", "entrypoint", "entrypointNumCpus"),
@@ -46,7 +46,7 @@ def of_yaml(name):
 
 
 def rate_lines(rates=RATES):
-    """The table of what was measured."""
+    """Yield the lines of the table of measured rates."""
     measured = {(row["model"], row["size"]): row for row in rates}
     yield "| network | size | pairs per core-hour | read, MB a pair | written, MB a pair |"
     yield "|---|---|---:|---:|---:|"
@@ -59,7 +59,7 @@ def rate_lines(rates=RATES):
 
 
 def plan_lines(rates=RATES):
-    """The table of what plans need, reckoned with `small` at 640x480."""
+    """Yield the lines of the table of the resources for each plan, computed for `small` at 640x480."""
     (row,) = (row for row in rates if (row["model"], row["size"]) == ("small", "640x480"))
     yield "| | " + " | ".join(f"{name} pairs" for name in PLANS) + " |"
     yield "|---|" + "---:|" * len(PLANS)
@@ -80,7 +80,7 @@ def plan_lines(rates=RATES):
 
 
 def rounded(number):
-    """To two figures."""
+    """Return a number as text with two significant figures."""
     return f"{number:.1f}" if number < 9.95 else f"{float(f'{number:.2g}'):,.0f}"
 
 
@@ -103,7 +103,7 @@ def stored(size_bytes):
 
 
 def commands():
-    """Every line of stereoweave in the page and in the files."""
+    """Return all stereoweave commands in the page and in the example files."""
     texts = [PAGE, *(path.read_text() for path in EXAMPLES.iterdir())]
     lines = [line for text in texts for line in text.splitlines()]
     found = [
@@ -113,12 +113,12 @@ def commands():
     return sorted({match[1].strip() for match in found if match})
 
 
-def test_the_tables_are_what_was_measured_and_what_follows_from_it():
+def test_the_tables_agree_with_the_measured_rates():
     assert [line for line in (*rate_lines(), *plan_lines()) if line not in PAGE.splitlines()] == []
 
 
 @pytest.mark.parametrize("line", commands())
-def test_each_command_has_options_that_there_are(line):
+def test_each_command_uses_existing_options(line):
     words = shlex.split(line)[1:]
     command = typer.main.get_command(app)
     while hasattr(command, "commands"):
@@ -126,7 +126,7 @@ def test_each_command_has_options_that_there_are(line):
     command.make_context("stereoweave", words)
 
 
-def test_the_options_that_the_page_names_are_those_of_the_commands():
+def test_the_options_that_the_page_names_exist():
     named = set(re.findall(r"`(--[a-z-]+)[ `]", PAGE))
     command = typer.main.get_command(app)
     options = set()
@@ -138,7 +138,7 @@ def test_the_options_that_the_page_names_are_those_of_the_commands():
     assert named - options == set()
 
 
-def test_ray_s_launcher_takes_the_cluster_file():
+def test_the_cluster_file_matches_the_schema_of_rays_launcher():
     config = of_yaml("ray-cluster.yaml")
     schema = json.loads((Path(ray.__file__).parent / "autoscaler" / "ray-schema.json").read_text())
     jsonschema.validate(config, schema)
@@ -147,7 +147,7 @@ def test_ray_s_launcher_takes_the_cluster_file():
     assert workers["min_workers"] <= workers["max_workers"] <= config["max_workers"]
 
 
-def test_the_manifest_of_kubernetes_has_fields_that_kuberay_documents():
+def test_the_kubernetes_manifest_has_only_fields_that_kuberay_documents():
     job = of_yaml("rayjob.yaml")
     assert (job["apiVersion"], job["kind"]) == ("ray.io/v1", "RayJob")
     assert job["spec"].keys() <= JOB_FIELDS
@@ -168,16 +168,16 @@ def test_one_version_of_ray_is_named_everywhere():
     texts = [PAGE, *(path.read_text() for path in EXAMPLES.iterdir())]
     named = {version for text in texts for version in re.findall(r"ray[^ \n]*?[:=-](2\.\d+\.\d+)", text)}
     assert named == {of_yaml("rayjob.yaml")["spec"]["rayClusterSpec"]["rayVersion"]}
-    assert int(named.pop().split(".")[1]) >= 54  # of the extra `cluster`
+    assert int(named.pop().split(".")[1]) >= 54  # the minimum of the extra `cluster`
 
 
-def test_the_columns_that_the_page_names_are_the_manifest_s():
+def test_the_page_names_all_columns_of_the_manifest_in_order():
     (table,) = re.findall(r"\| column \|.*?\n\n", PAGE, re.DOTALL)
     names = re.findall(r"`(\w+)`", "".join(line.split("|")[1] for line in table.split("\n") if line))
     assert names == _make_rows_schema().names
 
 
-def test_links_lead_somewhere():
+def test_links_lead_to_existing_files():
     links = re.findall(r"\]\(([^)#]+)\)", PAGE)
     missing = [link for link in links if "://" not in link and not (REPOSITORY / "docs" / link).exists()]
     assert missing == []

@@ -1,4 +1,4 @@
-"""Batches with real processes: what they make, what a bad pair or a killed process costs, and going on."""
+"""Batches with real processes: results, bad pairs, killed processes, and resumption."""
 
 import csv
 import io
@@ -49,14 +49,14 @@ if __name__ == "__main__":
 
 
 class KillingPair(NamedPair):
-    """A pair that kills the process it is sent to."""
+    """A pair that kills the process to which it is sent."""
 
     def __reduce__(self):
         return os.kill, (_OwnPid(), signal.SIGKILL)
 
 
 class ThreadRecordingPair(NamedPair):
-    """A pair that records the threads of the process it is sent to, in a file beside its left picture."""
+    """A pair that records the number of threads of its process in a file beside its left picture."""
 
     def __reduce__(self):
         return record_threads, (self.name, self.pictures)
@@ -69,7 +69,7 @@ def record_threads(name: str, pictures: tuple[Path, ...]) -> NamedPair:
 
 
 class ModelRemover(NamedPair):
-    """A pair that replaces the model file in the process it is sent to by an invalid one."""
+    """A pair that replaces the model file by an invalid one when it arrives in another process."""
 
     def __reduce__(self):
         return remove_model, (self.name, self.pictures)
@@ -81,14 +81,14 @@ def remove_model(name: str, pictures: tuple[Path, ...]) -> NamedPair:
 
 
 class _OwnPid:
-    """The id of whichever process unpickles it."""
+    """Stand-in for a process ID: unpickling it gives the ID of the current process."""
 
     def __reduce__(self):
         return os.getpid, ()
 
 
 def write_pairs(folder: Path, count: int, size_px=(96, 64)) -> Path:
-    """Small pairs 00, 01, ..., each another part of the example."""
+    """Write small pairs 00, 01, ..., each a different crop of the example, and return their folder."""
     width, height = size_px
     for side in ("left", "right"):
         (folder / side).mkdir(parents=True)
@@ -99,7 +99,7 @@ def write_pairs(folder: Path, count: int, size_px=(96, 64)) -> Path:
 
 
 def run_quietly(folder: Path, out: Path, job: DepthJob = JOB, **options) -> tuple[LocalTally, str]:
-    """The tally, and what was shown meanwhile."""
+    """Run a batch, and return its tally and its console output."""
     shown = io.StringIO()
     options.setdefault("pairs", find_pairs_in(folder).pairs)
     return run_batch(out=out, job=job, console=Console(file=shown), **options), shown.getvalue()
@@ -116,7 +116,7 @@ def read_summary(out: Path) -> dict[str, dict[str, str]]:
     return {row["name"]: row for row in rows}
 
 
-def test_a_bad_pair_is_reported_and_the_others_are_as_they_are_alone_and_the_next_run_does_what_is_missing(
+def test_a_bad_pair_is_reported_and_the_next_run_processes_only_unfinished_and_changed_pairs(
     tmp_path,
 ):
     folder, out = write_pairs(tmp_path / "pairs", 4), tmp_path / "out"
@@ -159,7 +159,7 @@ def test_a_bad_pair_is_reported_and_the_others_are_as_they_are_alone_and_the_nex
     ]
 
 
-def test_a_pair_that_fails_when_it_is_made_again_is_finished_no_more(tmp_path):
+def test_a_finished_pair_that_fails_in_a_later_run_is_no_longer_finished(tmp_path):
     folder, out = write_pairs(tmp_path / "pairs", 2), tmp_path / "out"
     assert run_quietly(folder, out, processes=1)[0].done == 2
     first, second = find_pairs_in(folder).pairs
@@ -171,10 +171,10 @@ def test_a_pair_that_fails_when_it_is_made_again_is_finished_no_more(tmp_path):
     assert list(read_summary(out)) == ["00"]
 
 
-def test_a_pair_is_there_only_with_its_pictures_and_its_mark_unharmed(tmp_path, capsys):
+def test_a_pair_counts_as_finished_only_if_its_pictures_and_done_file_are_intact(tmp_path, capsys):
     folder, out = write_pairs(tmp_path / "pairs", 3), tmp_path / "out"
     out.mkdir()
-    (out / ".DS_Store").touch()  # a folder of which only this is in it is a new one
+    (out / ".DS_Store").touch()  # a folder that holds only this file counts as new
     pairs = find_pairs_in(folder).pairs
     assert run_quietly(folder, out, processes=1)[0].done == 3
     (out / "00" / DONE_FILE).write_text("{")
@@ -188,7 +188,7 @@ def test_a_pair_is_there_only_with_its_pictures_and_its_mark_unharmed(tmp_path, 
 
 
 @pytest.mark.parametrize(("processes", "threads"), [(2, 1), (1, usable_cores())])
-def test_several_processes_have_a_thread_each_and_a_single_one_has_all_cores(
+def test_several_processes_use_one_thread_each_and_a_single_process_uses_all_cores(
     tmp_path, monkeypatch, processes, threads
 ):
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "7")
@@ -201,7 +201,7 @@ def test_several_processes_have_a_thread_each_and_a_single_one_has_all_cores(
     assert os.environ["OPENBLAS_NUM_THREADS"] == "7"
 
 
-def test_a_killed_batch_goes_on_and_so_does_an_interrupted_one_but_none_beside_another(tmp_path, capsys):
+def test_a_killed_or_interrupted_batch_resumes_but_not_while_another_one_runs(tmp_path, capsys):
     folder, out = write_pairs(tmp_path / "pairs", 24, (256, 192)), tmp_path / "out"
     before = {}
     for end, goal in ((signal.SIGKILL, 3), (signal.SIGINT, 8)):
@@ -211,7 +211,7 @@ def test_a_killed_batch_goes_on_and_so_does_an_interrupted_one_but_none_beside_a
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
-            # Where a shell starts the tests in the background, Ctrl-C is ignored by all that they start.
+            # If a shell starts the tests in the background, their child processes ignore Ctrl-C by default.
             preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
         )
         while len(read_write_times_ns(out)) < goal and process.poll() is None:
@@ -245,7 +245,7 @@ def test_a_killed_batch_goes_on_and_so_does_an_interrupted_one_but_none_beside_a
     assert not list(out.rglob(".*"))
 
 
-def test_a_pair_that_kills_its_process_is_named_and_costs_no_other(tmp_path, capsys):
+def test_a_pair_that_kills_its_process_is_named_and_affects_no_other_pair(tmp_path, capsys):
     folder, out = write_pairs(tmp_path / "pairs", 3), tmp_path / "out"
     first, second, third = find_pairs_in(folder).pairs
     pairs = [first, KillingPair(second.name, second.pictures), third]
@@ -254,14 +254,14 @@ def test_a_pair_that_kills_its_process_is_named_and_costs_no_other(tmp_path, cap
     assert json.loads(printed.out) == {
         "done": 2,
         "skipped": 0,
-        "failed": {"01": "its process was killed; is the memory full?"},
+        "failed": {"01": "its process was killed; did it run out of memory?"},
         "summary": str(out / "summary.csv"),
     }
     assert "01: its process was killed" in printed.err
     assert sorted(read_write_times_ns(out)) == ["00", "02"]
 
 
-def test_a_model_that_is_replaced_during_a_batch_is_not_taken_up(tmp_path):
+def test_a_model_file_replaced_during_a_batch_is_not_loaded(tmp_path):
     folder, out = write_pairs(tmp_path / "pairs", 2), tmp_path / "out"
     model = Path(shutil.copy(model_file("small"), folder / "model.onnx"))
     first, second = find_pairs_in(folder).pairs
@@ -270,10 +270,10 @@ def test_a_model_that_is_replaced_during_a_batch_is_not_taken_up(tmp_path):
     _load.cache_clear()
     assert run_quietly(folder, out, job, pairs=pairs, processes=1)[0] == LocalTally(2, 0, ())
     assert model.read_bytes() == b"no network"
-    assert _load.cache_info().currsize == 0  # in this process, which matches nothing
+    assert _load.cache_info().currsize == 0  # this process matches nothing
 
 
-def test_another_order_or_another_folder_is_refused_before_anything_starts(tmp_path):
+def test_another_job_or_an_unrelated_folder_is_refused_before_processing_starts(tmp_path):
     folder, out = write_pairs(tmp_path / "pairs", 1), tmp_path / "out"
     calibration = tmp_path / "calib.txt"
     calibration.write_text("first")
@@ -297,7 +297,7 @@ def test_another_order_or_another_folder_is_refused_before_anything_starts(tmp_p
     assert not (tmp_path / "new").exists()
 
 
-def test_a_scenes_own_calibration_gives_its_depth_in_metres_unless_one_is_named_for_all(tmp_path):
+def test_a_scenes_own_calibration_is_used_unless_one_is_given_for_all_scenes(tmp_path):
     folder, out = tmp_path / "scenes", tmp_path / "out"
     (folder / "room").mkdir(parents=True)
     for name in ("left.png", "right.png", "calib.txt"):
@@ -315,7 +315,7 @@ def test_a_scenes_own_calibration_gives_its_depth_in_metres_unless_one_is_named_
     assert np.median(other_mm / own_mm) == pytest.approx(2, rel=1e-3)
 
 
-def test_the_command_takes_a_list_and_makes_no_reports_unless_they_are_asked_for(tmp_path, capsys):
+def test_the_command_takes_a_list_and_writes_reports_only_on_request(tmp_path, capsys):
     folder, out = write_pairs(tmp_path / "pairs", 2), tmp_path / "out"
     (folder / "list.txt").write_text("left/00.png right/00.png quay\nleft/01.png right/none.png\n")
     words = ["depth", "--list", str(folder / "list.txt"), "--jobs", "1", "--threads", "1", "-o"]

@@ -1,4 +1,4 @@
-"""Rendered sets and scores by the workers of a cluster: the same as without one."""
+"""Sets and scores made by a cluster's workers: the same as those made by one process."""
 
 import csv
 import io
@@ -37,7 +37,7 @@ MEASURED = {"time_ms", "time_relative", "memory_mb"}
 
 @dataclass(frozen=True)
 class KilledOnce(PaintedPairMaker):
-    """Its process is killed at pair 6, the first time."""
+    """A pair maker whose process is killed at its first attempt at pair 6."""
 
     note: Path = Path()
 
@@ -50,7 +50,7 @@ class KilledOnce(PaintedPairMaker):
 
 @dataclass(frozen=True)
 class KeptToItself(PaintedPairMaker):
-    """The shard before pair 4 is seen by no other machine."""
+    """A pair maker that removes its first shard before pair 4, as if only its own machine had seen it."""
 
     out: Path = Path()
 
@@ -62,7 +62,7 @@ class KeptToItself(PaintedPairMaker):
 
 @pytest.fixture(scope="module")
 def cluster(ray_address):
-    """Its address; this process stays its driver for all tests here."""
+    """Yield the cluster's address; this process stays its driver for all tests of this module."""
     with connect(Engine(ray_address)):
         yield ray_address
 
@@ -78,7 +78,7 @@ def made(out, pairs=10, pair_maker=PAIR_MAKER, engine=None):
 
 @pytest.fixture(scope="module")
 def sets(tmp_path_factory):
-    """Two sets of a pair each, with a further view."""
+    """Return a folder of two sets, each with one pair and an additional view."""
     folder = tmp_path_factory.mktemp("sets")
     for number, name in enumerate(("crane", "ship")):
         sample = box_before_a_wall(np.random.default_rng(number), (96, 64))
@@ -89,7 +89,9 @@ def sets(tmp_path_factory):
 # Rendered sets
 
 
-def test_a_cluster_goes_on_to_the_bytes_of_one_process_though_a_worker_is_killed(tmp_path, cluster):
+def test_a_cluster_completes_a_set_to_the_same_bytes_as_one_process_despite_a_killed_worker(
+    tmp_path, cluster
+):
     made(tmp_path / "one")
     made(tmp_path / "many", pairs=4)
     pair_maker = KilledOnce(note=tmp_path / "killed")
@@ -98,7 +100,7 @@ def test_a_cluster_goes_on_to_the_bytes_of_one_process_though_a_worker_is_killed
     assert contents(tmp_path / "many") == contents(tmp_path / "one")
 
 
-def test_pairs_that_a_cluster_made_where_nobody_else_sees_them_are_missed(tmp_path, cluster):
+def test_pairs_that_only_one_machine_of_the_cluster_sees_are_reported_missing(tmp_path, cluster):
     message = error_of(made, tmp_path, 10, KeptToItself(out=tmp_path), Engine(cluster, workers=1))
     assert message.startswith(
         f"{tmp_path}: expected all pairs that the cluster made, found 4 of them missing"
@@ -117,7 +119,7 @@ def test_a_machine_that_sees_another_folder_or_would_make_other_pairs_is_named(t
 
 
 @pytest.mark.needs_egl
-def test_a_rendered_set_is_the_same_from_a_cluster(tmp_path, cluster, monkeypatch):
+def test_a_cluster_renders_the_same_set_as_one_process(tmp_path, cluster, monkeypatch):
     monkeypatch.chdir(tmp_path)
     line = "synth make pylon --pairs 2 --size 48x32 --plain --jobs 1"
     assert main(f"{line} -o one".split()) == 0
@@ -128,7 +130,7 @@ def test_a_rendered_set_is_the_same_from_a_cluster(tmp_path, cluster, monkeypatc
 # Scores
 
 
-def test_a_cluster_finds_the_errors_that_one_process_finds(sets, tmp_path, cluster):
+def test_a_cluster_measures_the_same_disparity_errors_as_one_process(sets, tmp_path, cluster):
     line = f"bench pairs {sets} --model small --threads 1 -o {tmp_path}/many.csv --cluster {cluster}"
     assert main(line.split()) == 0
     makers = {
@@ -143,7 +145,7 @@ def test_a_cluster_finds_the_errors_that_one_process_finds(sets, tmp_path, clust
     assert all(float(row["time_ms"]) > 0 for row in many)
 
 
-def test_a_cluster_finds_the_views_that_one_process_finds(sets, tmp_path, cluster):
+def test_a_cluster_measures_the_same_view_errors_as_one_process(sets, tmp_path, cluster):
     line = f"bench views {sets} --model small --threads 1"
     assert main(f"{line} -o {tmp_path}/one.csv".split()) == 0
     assert main(f"{line} -o {tmp_path}/many.csv --cluster {cluster}".split()) == 0
