@@ -117,7 +117,7 @@ def estimate(photos) -> sw.Estimate:
     return sw.estimate(*photos, model="small")
 
 
-def test_the_disparity_of_a_pair_equals_the_librarys(service, estimate, tmp_path):
+def test_the_service_gives_the_same_disparity_as_the_library(service, estimate, tmp_path):
     pfm = save_content(post(service, "/disparity", file="pfm"), tmp_path / "disparity.pfm")
     np.testing.assert_allclose(read_pfm(pfm), estimate.disparity_px, atol=1e-3)
     png = save_content(post(service, "/disparity"), tmp_path / "disparity.png")
@@ -134,7 +134,7 @@ def test_a_pair_with_a_calibration_gives_depth_in_metres(service, estimate, phot
     assert report["camera"]["focal_px"] == 600
 
 
-def test_a_view_equals_the_librarys(service, photos, tmp_path):
+def test_the_service_renders_the_same_view_as_the_library(service, photos, tmp_path):
     view = save_content(post(service, "/view", position=0.3), tmp_path / "view.png")
     expected = sw.synthesize(*photos, 0.3, model="small").image.astype(int)
     assert np.abs(read_image(view) - expected).mean() < 0.01

@@ -56,7 +56,7 @@ def certificate(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def port(tmp_path_factory, certificate) -> Iterator[int]:
-    """Yield the port of an nginx with the shipped configuration, except for paths, ports and one time."""
+    """Yield the port of an nginx with the shipped configuration, except for paths, ports and a timeout."""
     folder = tmp_path_factory.mktemp("nginx")
     with socket.create_server(("127.0.0.1", 0)) as listener, run_http_server(app, listener, ClientTimeouts()):
         (port,) = find_free_ports(1)
