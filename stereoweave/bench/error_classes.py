@@ -1,6 +1,6 @@
 """Disparity errors by class of pixel: occluded, near depth edges, plain or textured.
 
-The classes depend only on the ground truth and the left image, so that all matchers are compared on the same
+The classes depend only on the ground truth and the left image, so all matchers are compared on the same
 pixels. Every known pixel belongs to exactly one class, the first that applies:
 
     outside        its match lies beyond the right image's left border
@@ -25,20 +25,20 @@ ALL = "all"
 THIN_PX = 15
 PLAIN_LEVELS_PER_PX = 1.0
 WEAK_LEVELS_PER_PX = 2.0
-# After this smoothing, noise of 3 levels stays below 1 level per pixel in 93 % of pixels: not texture.
+# After this smoothing, noise of 3 levels has a gradient below 1 in 93 % of pixels, so it is not texture.
 _SMOOTHING_PX = 1.0
-# A slanted surface occludes itself by less than this, a nearer surface by more.
+# Points of a slanted surface that land together differ by less than this; a nearer surface differs by more.
 _COVERED_STEP_PX = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class ClassErrors:
-    """An estimate's errors in one class of pixels; NaN if the class is empty.
+    """Errors of an estimate in one class of pixels; errors within an empty class are NaN.
 
     Attributes:
         share_percent: Share of known pixels that are in the class.
         bad1_percent, bad2_percent: Share of known pixels that are in the class and off by more than 1 or
-            2 px. The classes add up to the estimate's bad-1 and bad-2; an empty class has 0.
+            2 px. Summed over the classes, they give the estimate's bad-1 and bad-2; an empty class has 0.
         bad1_within_percent, bad2_within_percent: Share of the class that is off by more than 1 or 2 px.
         epe_px: Mean absolute error within the class.
     """
@@ -102,10 +102,10 @@ def class_errors(
 
 
 def find_covered(truth_px: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Return a mask of the known pixels that a surface more than 1 px nearer covers in the right image.
+    """Return the mask of the known pixels that a surface nearer by more than 1 px covers in the right image.
 
-    Uses the left truth alone: projects every known pixel to the nearest column of the right image and keeps
-    the nearest surface there.
+    Only the left truth is used: every known pixel is projected to the nearest column of the right image,
+    where the nearest surface is kept.
     """
     width = truth_px.shape[1]
     target = np.rint(np.arange(width) - truth_px)
@@ -120,8 +120,12 @@ def find_covered(truth_px: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
 
 
 def _find_thin(known_px: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Find objects narrower than THIN_PX: nearer than both sides by more than EDGE_STEP_PX."""
-    # Unknown pixels count as near, so that they bound no object.
+    """Return the mask of thin objects.
+
+    A thin object is narrower than THIN_PX, and nearer than the surfaces on both sides by more than
+    EDGE_STEP_PX.
+    """
+    # Unknown pixels count as infinitely near, so they never bound an object.
     surface_px = np.where(np.isnan(known_px), np.inf, known_px).astype(np.float32)
     behind_px = np.full_like(surface_px, np.inf)
     for window in ((1, THIN_PX), (THIN_PX, 1)):
@@ -131,10 +135,10 @@ def _find_thin(known_px: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
 
 
 def _measure_gradient(left: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w"]:
-    """Gradient magnitude of the smoothed grey image, in levels of 0..255 per pixel."""
+    """Return the gradient magnitude of the smoothed grey image, in levels of 0..255 per pixel."""
     grey = cv2.cvtColor(left, cv2.COLOR_RGB2GRAY).astype(np.float32)
     smooth = cv2.GaussianBlur(grey, (0, 0), _SMOOTHING_PX)
-    # Sobel's kernel amplifies by 8: weights of 1, 2, 1 on a difference over two pixels.
+    # The Sobel kernel amplifies by 8: weights of 1, 2 and 1, each on a difference over two pixels.
     along_x, along_y = (cv2.Sobel(smooth, cv2.CV_32F, *order, scale=1 / 8) for order in ((1, 0), (0, 1)))
     return np.hypot(along_x, along_y)
 

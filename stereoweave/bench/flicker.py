@@ -30,24 +30,24 @@ from stereoweave.video.temporal_filter import TemporalFilter
 
 MEAN = "mean"
 FRAME_BY_FRAME, STEADY = "frame by frame", "steady"
-# Length of the camera path: five seconds.
+# Length of the whole camera path: five seconds.
 _PATH_FRAMES = 120
 
 
 @dataclass(frozen=True, kw_only=True)
 class FlickerRow:
-    """Scores of one method on one video. Errors are means over all such pixels from the second frame on.
+    """Scores of one method on one video. Errors are means over the pixels of all frames but the first.
 
     Attributes:
         film: The video's name.
-        noise_levels: Standard deviation of the noise, 0 to 255.
+        noise_levels: Standard deviation of the image noise, in levels of 0..255.
         flicker_px: Flicker of the left view's disparity (flicker_metrics.py).
-        view_flicker_levels: Flicker of the middle view, 0 to 255, rendered from the noise-free images, so
-            that only disparity makes it flicker.
+        view_flicker_levels: Flicker of the middle view, in levels of 0..255. The view is rendered from the
+            noise-free images, so it flickers only if the disparity does.
         epe_px: End-point error of the left view.
-        moving_epe_px: End-point error on the moving object; NaN without one.
+        moving_epe_px: End-point error on the moving object; NaN if there is none.
         uncovered_epe_px: End-point error on pixels that the previous frame did not show; NaN without any.
-        time_ms: Median time of the temporal filter per frame; NaN without it.
+        time_ms: Median time of the temporal filter per frame; NaN without the filter.
     """
 
     film: str
@@ -67,7 +67,7 @@ class FlickerRow:
 
 
 class _MethodOutput(NamedTuple):
-    """A method's output for one video."""
+    """Output of one method for one video."""
 
     disparities_px: list[Float[np.ndarray, "h w"]]
     views: list[UInt8[np.ndarray, "h w 3"]]
@@ -84,10 +84,10 @@ def score_flicker(  # noqa: PLR0913 - each is a word of the command line
     threads: int | None = None,
     provider: str = CPU,
 ) -> Iterator[FlickerRow]:
-    """Yield two rows, frame by frame and steady, for each of four videos per scene.
+    """Yield two rows, without and with the temporal filter, for each of four videos per scene.
 
     Args:
-        scenes: Scene names of `stereoweave synth make`.
+        scenes: Scene names, as for `stereoweave synth make`.
         model: See `Matcher`.
         frames: Frames per video, at least 2.
         size_px: Width and height.
@@ -96,10 +96,10 @@ def score_flicker(  # noqa: PLR0913 - each is a word of the command line
         provider: See `Matcher`.
 
     Raises:
-        StereoweaveError: Unknown scene or model, or too few frames.
+        StereoweaveError: If a scene or the model is unknown, or there are too few frames.
     """
     if frames < 2:
-        raise StereoweaveError(f"frames: expected 2 or more, because flicker compares two; got {frames}")
+        raise StereoweaveError(f"frames: expected 2 or more, because flicker compares two, found {frames}")
     specs = [RenderSpec(scene=scene, seed=seed, size_px=size_px, frames=_PATH_FRAMES) for scene in scenes]
     matcher = Backend(model=model, threads=threads, provider=provider).matcher()
     for spec in specs:
@@ -125,7 +125,7 @@ def score_flicker(  # noqa: PLR0913 - each is a word of the command line
 
 
 def average_rows(rows: Sequence[FlickerRow]) -> list[FlickerRow]:
-    """Average over the scenes for each video and method; the new `film` joins both names."""
+    """Return a mean row over the scenes for each video and method; its `film` joins both names."""
     groups: dict[tuple[str, str], list[FlickerRow]] = {}
     for row in rows:
         groups.setdefault((row.film, row.method), []).append(row)
@@ -163,7 +163,7 @@ def _run_methods(
 def _render_middle(
     video: RenderedVideo, estimates: list[Estimate], threads: int | None
 ) -> tuple[list[Float[np.ndarray, "h w"]], list[UInt8[np.ndarray, "h w 3"]]]:
-    """Return the left view's disparities, and the middle views rendered from the noise-free video."""
+    """Return the left views' disparities, and the middle views rendered from the noise-free video."""
     renderers = (
         Renderer(pair, estimate, threads=threads)
         for pair, estimate in zip(video.pairs, estimates, strict=True)
@@ -173,7 +173,7 @@ def _render_middle(
 
 
 def _measure_errors(video: RenderedVideo, result: _MethodOutput) -> dict[str, float]:
-    """Compute the error columns of a row."""
+    """Return the error columns of a row."""
     later = range(1, len(video.pairs))
 
     def mean_flicker(shown: list[np.ndarray], position: float, with_change: bool) -> float:

@@ -1,4 +1,4 @@
-"""Flicker of a video: the difference between frames after compensation of the true motion."""
+"""Flicker of a video: the difference between frames after compensation for the true motion."""
 
 from itertools import product
 
@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Shaped
 
 from stereoweave.errors import StereoweaveError
 
-# Two frames' truths of one point differ by interpolation and slant; two surfaces differ by more than this.
+# Between frames, interpolation and slant change a point's true disparity by less than this.
 _SAME_SURFACE_PX = 1.0
 
 
@@ -19,28 +19,28 @@ def flicker(
     visible: Bool[np.ndarray, "h w"],
     change: Float[np.ndarray, "h w"] | float = 0.0,
 ) -> float:
-    """Mean error of a point's change from one frame to the next, in the values' unit; NaN without points.
+    """Return the mean error of the points' change from one frame to the next; NaN without points.
 
-    The error at x is |after(x + motion(x)) - before(x) - change(x)|, with `after` interpolated linearly; a
-    constant error is not flicker. For disparity this is the temporal end-point error (TEPE) of Li et al.
-    2023, "Temporally Consistent Online Depth Estimation in Dynamic Scenes". For images, whose true change is
-    0, it is the warping error of Lai et al. 2018, "Learning Blind Video Temporal Consistency", but with the
-    true motion and not squared.
+    The error at x is |after(x + motion(x)) - before(x) - change(x)|, in the unit of the values, with `after`
+    interpolated linearly. An error that stays constant is not flicker. For disparity, this is the temporal
+    end-point error (TEPE) of Li et al. 2023, "Temporally Consistent Online Depth Estimation in Dynamic
+    Scenes". For images, whose true change is 0, it is the warping error of Lai et al. 2018, "Learning Blind
+    Video Temporal Consistency", but with the true motion and without squaring.
 
     Args:
         before: Disparity in px [H, W], or an image [H, W] or [H, W, C].
         after: The same for the next frame.
-        motion_px: Motion right and down, from a point's place in `before` to its place in `after`.
-        visible: The points that count, such as those that both frames show (`find_seen_again`).
+        motion_px: Motion of each point to the right and down, from `before` to `after`.
+        visible: Mask of the points that count, such as those visible in both frames (`find_seen_again`).
         change: True change of each point's value.
 
     Raises:
-        StereoweaveError: The sizes differ, or a visible point leaves the image.
+        StereoweaveError: If the sizes differ, or a visible point leaves the image.
     """
     shapes = [list(values.shape[:2]) for values in (before, after, motion_px, visible)]
     if any(shape != shapes[0] for shape in shapes):
         raise StereoweaveError(
-            f"flicker: expected two frames, their motion and a mask of one size, got {shapes}"
+            f"flicker: expected two frames, their motion and a mask of one size, found {shapes}"
         )
     columns, rows, inside = _find_targets(motion_px)
     if (visible & ~inside).any():
@@ -64,12 +64,14 @@ def find_seen_again(
     motion_px: Float[np.ndarray, "h w 2"],
     change_px: Float[np.ndarray, "h w"],
 ) -> Bool[np.ndarray, "h w"]:
-    """Return a mask of the points visible in both frames: all four pixels at the target show the surface.
+    """Return the mask of the points that are visible in both frames.
+
+    A point of the first frame is visible in the second if all four pixels around its target show its surface.
 
     Args:
         before_px: True disparity of the first frame.
         after_px: True disparity of the second frame.
-        motion_px: Motion right and down, from a point's place in the first frame to that in the second.
+        motion_px: Motion of each point to the right and down, from the first frame to the second.
         change_px: True change of each point's disparity.
     """
     columns, rows, inside = _find_targets(motion_px)
@@ -85,7 +87,7 @@ def find_seen_again(
 def _find_targets(
     motion_px: Float[np.ndarray, "h w 2"],
 ) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """Return the columns and rows that points move to, and a mask of those inside the image."""
+    """Return the columns and rows to which points move, and the mask of those inside the image."""
     height, width = motion_px.shape[:2]
     rows, columns = np.indices((height, width), np.float32)
     columns, rows = columns + motion_px[..., 0], rows + motion_px[..., 1]

@@ -16,26 +16,26 @@ from stereoweave.synth.viewpoints import PosedRig
 
 LEFT, MIDDLE, RIGHT = 0.0, 0.5, 1.0
 NOISE_LEVELS = 4.0
-# Supersampling per axis of a passing object, so that it can move by quarters of a pixel.
+# Supersampling of a passing object along each axis, so that it can move by quarters of a pixel.
 _FINE = 4
-# Least disparity of the object in front of everything else.
+# How much the object's disparity exceeds the greatest of the scene, at least.
 _IN_FRONT_PX = 8
 
 Change = tuple[Float[np.ndarray, "h w 2"], Float[np.ndarray, "h w"]]
-"""Change of a frame's points on the way to another frame, seen from one view: motion right and down in px,
-and change of disparity in px."""
+"""Change of a frame's points from that frame to another, seen from one position: motion to the right and down
+in px, and change of disparity in px."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RenderedVideo:
-    """A video with its ground truth.
+    """A rendered video with its ground truth.
 
     Attributes:
-        name: What happens in it.
+        name: Name of what happens in the video, such as "passing".
         pairs: The frames, without noise.
         disparities_px: True disparity [H, W] of each frame in the views at LEFT and MIDDLE.
         moving: Mask of the moving object in the left view of each frame.
-        change: `Change` of the points from one frame to another, seen from a position.
+        change: Returns the `Change` from one frame to another, seen from a position.
     """
 
     name: str
@@ -45,13 +45,13 @@ class RenderedVideo:
     change: Callable[[int, int, float], Change]
 
     def find_seen_again(self, frame: int, other: int, position: float) -> Bool[np.ndarray, "h w"]:
-        """Return a mask of a frame's points that are also visible in another frame, seen from a position."""
+        """Return the mask of a frame's points that another frame also shows, seen from the same position."""
         before_px, after_px = (self.disparities_px[number][position] for number in (frame, other))
         return find_seen_again(before_px, after_px, *self.change(frame, other, position))
 
 
 def add_noise(pair: StereoPair, rng: np.random.Generator) -> StereoPair:
-    """Add sensor noise: normal, NOISE_LEVELS strong, independent for each eye, pixel and channel."""
+    """Add Gaussian sensor noise of NOISE_LEVELS, independent for each image, pixel and channel."""
 
     def add(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
         return np.rint(image + rng.normal(0, NOISE_LEVELS, image.shape)).clip(0, 255).astype(np.uint8)
@@ -60,7 +60,7 @@ def add_noise(pair: StereoPair, rng: np.random.Generator) -> StereoPair:
 
 
 def render_panning(spec: RenderSpec, frames: int) -> RenderedVideo:
-    """Render `frames` frames from the middle of the camera path, where the camera is fastest."""
+    """Render the middle `frames` frames of the camera path, where the camera moves fastest."""
     first = (spec.frames - frames) // 2
     stages = [draw_stage_and_rig(shared_renderer(), spec, 0, first + number) for number in range(frames)]
     rigs = [rig for _, rig in stages]
@@ -90,12 +90,12 @@ def render_panning(spec: RenderSpec, frames: int) -> RenderedVideo:
 def reproject(
     disparity_px: Float[np.ndarray, "h w"], rig: PosedRig, other: PosedRig, position: float
 ) -> Change:
-    """Compute the change of a view's points when the rig moves to the pose of `other`.
+    """Return the `Change` of a view's points when the rig moves to the pose of `other`.
 
     Args:
         disparity_px: Disparity of the view's pixels; 0 for the sky.
-        rig: The rig of the view.
-        other: The same camera at another pose.
+        rig: Rig that the view belongs to.
+        other: The same rig at another pose.
         position: Position of the view in both rigs.
     """
     lens, turn = rig.camera, other.axes @ rig.axes.T
@@ -104,7 +104,7 @@ def reproject(
     ray = np.stack(
         [(columns - lens.cx_px) / lens.focal_px, (rows - lens.cy_px) / lens.focal_px, 1 + 0 * rows]
     )
-    # Everything is divided by the point's depth in the first view, so that the sky may be infinitely far.
+    # Everything is divided by the point's depth in the first view, so the sky may be infinitely far away.
     point = np.tensordot(turn, ray, 1) + shift[:, None, None] * disparity_px / (
         lens.focal_px * lens.baseline_m
     )
@@ -130,15 +130,15 @@ def freeze(video: RenderedVideo) -> RenderedVideo:
 def add_passing_oval(
     video: RenderedVideo, name: str, velocity_px: tuple[float, float], nearing_px: float = 0.0
 ) -> RenderedVideo:
-    """Return a video of the same length: the first frame, and an oval that moves in front of it.
+    """Return a video of the same length in which an oval moves in front of the first frame.
 
-    The oval shows the frame itself, upside down and at a quarter of its size.
+    The oval shows the same frame, upside down and at a quarter of its size.
 
     Args:
         video: The video whose first frame is used.
         name: The new video's name.
-        velocity_px: Motion of the oval in the left view, right and down per frame; multiples of 0.25.
-        nearing_px: Growth of its disparity per frame; a multiple of 0.5.
+        velocity_px: Motion of the oval per frame in the left view, to the right and down; multiples of 0.25.
+        nearing_px: Increase of the oval's disparity per frame; a multiple of 0.5.
     """
     pair, truth_px = video.pairs[0], video.disparities_px[0]
     height, width = video.moving[0].shape
@@ -184,11 +184,11 @@ def add_passing_oval(
 def _paste_oval(
     image: UInt8[np.ndarray, "h w 3"], picture: UInt8[np.ndarray, "h w 3"], left_px: float, top_px: float
 ) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
-    """Return the image with the oval of `add_passing_oval`, and the mask of pixels at least half covered.
+    """Return the image with an oval pasted in, and the mask of pixels that are at least half covered by it.
 
     Args:
         image: The background.
-        picture: Content of the oval, painted upside down and four times smaller.
+        picture: Image that the oval shows, upside down and at a quarter of its size.
         left_px: Left edge of the oval's bounding box; a multiple of 0.25.
         top_px: Top edge; a multiple of 0.25.
     """

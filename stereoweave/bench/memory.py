@@ -11,14 +11,14 @@ Argument = TypeVar("Argument")
 
 
 def peak_memory_mb(make: Callable[[], Callable[[Argument], object]], argument: Argument) -> float:
-    """Rise of peak resident memory, in 10^6 bytes, while a function is made and called once.
+    """Return the rise in peak resident memory, in 10^6 bytes, while a function is made and called once.
 
-    Measured in a fresh process. Includes what making the function loads, such as a network, and what the
-    first call needs, its result included. Excludes what is loaded before: Python, NumPy, OpenCV, ONNX Runtime
-    and the argument. NaN where the system does not report it (Windows).
+    The rise is measured in a fresh process. It includes what making the function loads, such as a network,
+    and what the first call allocates, such as its result. It excludes what is loaded beforehand: Python,
+    NumPy, OpenCV, ONNX Runtime and the argument. It is NaN on Windows, which does not report peak memory.
 
     Args:
-        make: Makes the function. It is pickled: use a module-level function or a partial of one.
+        make: Makes the function. Must be picklable, such as a module-level function or a partial of one.
         argument: The function's argument.
     """
     import cv2
@@ -41,7 +41,7 @@ def _read_peak_mb() -> float:
     """Return this process's peak resident memory so far."""
     status = Path("/proc/self/status")
     if status.exists():
-        # Not getrusage: on Linux a child starts at its parent's peak there.
+        # Not getrusage, whose peak for a child process starts at the parent's on Linux.
         (line,) = (line for line in status.read_text().splitlines() if line.startswith("VmHWM:"))
         return int(line.split()[1]) * 1024 / 1e6
     if sys.platform == "win32":

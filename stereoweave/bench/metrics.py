@@ -1,6 +1,6 @@
-"""Error metrics, in double precision; the package's only implementation.
+"""Error metrics in double precision, for all benchmarks and validations.
 
-In ground truth NaN and infinity mean unknown, and unknown pixels do not count. A pixel whose estimate is NaN
+In ground truth, NaN and infinity mean unknown, and unknown pixels do not count. A pixel whose estimate is NaN
 is bad. A mean over no pixel is NaN.
 """
 
@@ -12,18 +12,18 @@ from jaxtyping import Bool, Float, UInt8
 
 from stereoweave.errors import StereoweaveError
 
-# As in Guo et al. 2017.
+# Number of confidence bins, as in Guo et al. 2017.
 _BINS = 15
 DROPPED_PERCENT = np.arange(96)
-"""Shares of the pixels that `sparsification` drops."""
+"""Percentages of the pixels that `sparsification` drops."""
 
 
 class Sparsification(NamedTuple):
-    """Mean error of the remaining pixels after 0, 1, ... 95 % are dropped, [96], in the error's unit.
+    """Mean errors [96] of the pixels that remain after 0, 1, ..., 95 % are dropped, in the error's unit.
 
     Attributes:
-        kept: Drops the least confident pixels first.
-        oracle: Drops the pixels of largest error first; no confidence can do better.
+        kept: Errors if the least confident pixels are dropped first.
+        oracle: Errors if the pixels of largest error are dropped first; no confidence can do better.
     """
 
     kept: Float[np.ndarray, " n"]
@@ -31,15 +31,15 @@ class Sparsification(NamedTuple):
 
     @property
     def ause(self) -> float:
-        """Area between the two curves over the share dropped (AUSE); 0 is best.
+        """Area between the two curves over the dropped share of pixels (AUSE); 0 is best.
 
-        Source: Ilg et al. 2018, who divide errors by the mean over all pixels; here they keep their unit.
+        Source: Ilg et al. 2018, who divide errors by the mean over all pixels; here, errors keep their unit.
         """
         return float(np.trapezoid(self.kept - self.oracle, DROPPED_PERCENT / 100))
 
 
 def epe_px(estimate_px: Float[np.ndarray, "h w"], truth_px: Float[np.ndarray, "h w"]) -> float:
-    """End-point error: the mean absolute error of disparity in pixels."""
+    """Return the end-point error: the mean absolute error of disparity, in pixels."""
     error_px, _ = _known_errors(estimate_px, truth_px)
     return _mean(error_px)
 
@@ -47,19 +47,19 @@ def epe_px(estimate_px: Float[np.ndarray, "h w"], truth_px: Float[np.ndarray, "h
 def bad_percent(
     estimate_px: Float[np.ndarray, "h w"], truth_px: Float[np.ndarray, "h w"], threshold_px: float
 ) -> float:
-    """Percent of known pixels whose disparity is off by more than threshold_px (Middlebury's bad-n)."""
+    """Return the percentage of known pixels that are off by more than threshold_px (Middlebury's bad-n)."""
     error_px, _ = _known_errors(estimate_px, truth_px)
     return 100 * _mean(~(error_px <= threshold_px))
 
 
 def d1_percent(estimate_px: Float[np.ndarray, "h w"], truth_px: Float[np.ndarray, "h w"]) -> float:
-    """Percent of known pixels whose disparity is off by over 3 px and over 5 % (KITTI 2015's D1)."""
+    """Return the percentage of known pixels that are off by more than 3 px and 5 % (KITTI 2015's D1)."""
     error_px, known_px = _known_errors(estimate_px, truth_px)
     return 100 * _mean(~((error_px <= 3) | (error_px <= 0.05 * np.abs(known_px))))
 
 
 def depth_error_m(estimate_m: Float[np.ndarray, "h w"], truth_m: Float[np.ndarray, "h w"]) -> float:
-    """Mean absolute error of depth in metres; infinite where a known depth is estimated as infinite."""
+    """Return the mean absolute depth error in metres; infinite if a known depth is estimated as infinite."""
     error_m, _ = _known_errors(estimate_m, truth_m)
     return _mean(error_m)
 
@@ -69,20 +69,21 @@ def mae(
     truth: UInt8[np.ndarray, "h w 3"],
     where: Bool[np.ndarray, "h w"] | None = None,
 ) -> float:
-    """Mean absolute difference of two images, in grey levels of 0..255, over the pixels `where`."""
+    """Return the mean absolute difference of two images, in levels of 0..255, over the mask `where`."""
     error = np.abs(_subtract(image, truth))
     return _mean(error if where is None else error[where])
 
 
 def psnr_db(image: UInt8[np.ndarray, "h w 3"], truth: UInt8[np.ndarray, "h w 3"]) -> float:
-    """Peak signal-to-noise ratio of two images in dB; at most 148 dB, a mean squared error of 1e-10."""
+    """Return the peak signal-to-noise ratio of two images in dB; equal images have 148 dB."""
     return float(10 * np.log10(255**2 / max(_mean(_subtract(image, truth) ** 2), 1e-10)))
 
 
 def ssim(image: UInt8[np.ndarray, "h w 3"], truth: UInt8[np.ndarray, "h w 3"]) -> float:
-    """Mean structural similarity of two images' luminance, rounded to 8 bits; 1 if they are equal.
+    """Return the mean structural similarity of two images' 8-bit luminance; 1 if it is equal.
 
-    Source: Wang et al. 2004: 11x11 Gaussian window of sigma 1.5, K1 = 0.01, K2 = 0.03. Borders are mirrored.
+    Source: Wang et al. 2004, with an 11x11 Gaussian window of sigma 1.5, K1 = 0.01 and K2 = 0.03. Borders are
+    mirrored.
     """
     _check_shapes(image, truth)
     a, b = (cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).astype(np.float64) for picture in (image, truth))
@@ -95,9 +96,9 @@ def ssim(image: UInt8[np.ndarray, "h w 3"], truth: UInt8[np.ndarray, "h w 3"]) -
 
 
 def calibration_error(probability: Float[np.ndarray, "..."], happened: Bool[np.ndarray, "..."]) -> float:
-    """Expected calibration error: the mean gap between predicted probability and observed frequency.
+    """Return the expected calibration error: the mean gap between probability and observed frequency.
 
-    Source: Guo et al. 2017: equal bins, weighted by their number of values.
+    Source: Guo et al. 2017, with bins of equal width, each weighted by its number of values.
     """
     if not probability.size:
         return float("nan")
@@ -108,7 +109,7 @@ def calibration_error(probability: Float[np.ndarray, "..."], happened: Bool[np.n
 def calibration_bins(
     probability: Float[np.ndarray, "..."], happened: Bool[np.ndarray, "..."]
 ) -> Float[np.ndarray, "3 n"]:
-    """Mean probability, observed frequency and fraction of the values, for each non-empty bin of 15."""
+    """Return mean probability, observed frequency and share of values for each non-empty bin, out of 15."""
     where = np.minimum((probability * _BINS).astype(int), _BINS - 1).ravel()
     counts = np.bincount(where, minlength=_BINS)
     used = counts > 0
@@ -117,13 +118,13 @@ def calibration_bins(
 
 
 def sparsification(error: Float[np.ndarray, " n"], confidence: Float[np.ndarray, " n"]) -> Sparsification:
-    """Compute the sparsification curve of a confidence, and the oracle's.
+    """Return the sparsification curves of a confidence and of the oracle.
 
-    Source: Ilg et al. 2018. Ties in confidence are averaged over all orders.
+    Source: Ilg et al. 2018. Curves are averaged over all orders of pixels of equal confidence.
 
     Args:
         error: Error of each pixel [N], such as its absolute error in px, or 100 if bad and 0 if good.
-        confidence: Any value that ranks the pixels [N]; may be infinite, not NaN.
+        confidence: Any value that ranks the pixels [N]; may be infinite but not NaN.
     """
     _check_shapes(error, confidence)
     return Sparsification(kept=_average_kept(error, confidence), oracle=_average_kept(error, -error))
@@ -132,7 +133,7 @@ def sparsification(error: Float[np.ndarray, " n"], confidence: Float[np.ndarray,
 def _average_kept(
     error: Float[np.ndarray, " n"], confidence: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, " m"]:
-    """Mean error of the pixels that remain at each share of `DROPPED_PERCENT`."""
+    """Return the mean error of the pixels that remain after each of `DROPPED_PERCENT` is dropped."""
     if not error.size:
         return np.full(len(DROPPED_PERCENT), np.nan)
     _, group, counts = np.unique(-confidence, return_inverse=True, return_counts=True)
@@ -144,7 +145,7 @@ def _average_kept(
 def _known_errors(
     estimate: Float[np.ndarray, "h w"], truth: Float[np.ndarray, "h w"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Return the absolute errors at the pixels of known truth, and the truth there."""
+    """Return the absolute errors at the pixels of known truth, and their truth."""
     _check_shapes(estimate, truth)
     known = np.isfinite(truth)
     known_truth = truth[known].astype(np.float64)
@@ -167,8 +168,6 @@ def _mean(values: Float[np.ndarray, "..."] | Bool[np.ndarray, "..."]) -> float:
 
 
 def _check_shapes(estimate: np.ndarray, truth: np.ndarray) -> None:
-    # NumPy would broadcast where it can, and the score would be meaningless.
+    # Otherwise NumPy might broadcast, and the score would be meaningless.
     if estimate.shape != truth.shape:
-        raise StereoweaveError(
-            f"expected an estimate of the truth's shape {truth.shape}, found {estimate.shape}"
-        )
+        raise StereoweaveError(f"estimate: expected the truth's shape {truth.shape}, found {estimate.shape}")

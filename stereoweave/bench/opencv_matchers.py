@@ -1,4 +1,4 @@
-"""OpenCV's matchers with the settings of its sample, hole filling and left-right confidence."""
+"""OpenCV's matchers, set as in OpenCV's sample, and their hole filling and left-right confidence."""
 
 from collections.abc import Callable
 from functools import partial
@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float32, UInt8
 from stereoweave.stereo import StereoPair
 
 MapMatch = Callable[[StereoPair], Float32[np.ndarray, "h w"]]
-"""Computes the left view's disparity in px [H, W] of a pair; values <= 0 are holes."""
+"""Returns the left disparity of a pair, in px [H, W]; values <= 0 are holes."""
 
 SGBM = "sgbm"
 DISPARITIES = 192
@@ -19,8 +19,8 @@ DISPARITIES = 192
 def _make_sgbm(mode: int) -> MapMatch:
     """Create a semi-global block matcher over 192 disparities.
 
-    Settings: OpenCV's sample stereo_match.cpp at a block size of 5 (P1 = 8*3*5*5, P2 = 32*3*5*5), except
-    that the speckle range is 2, as StereoSGBM's documentation recommends, and not the sample's 32.
+    The settings are those of OpenCV's sample stereo_match.cpp at a block size of 5 (P1 = 8*3*5*5,
+    P2 = 32*3*5*5). Only the speckle range is 2 instead of 32, as StereoSGBM's documentation recommends.
     """
     matcher = cv2.StereoSGBM.create(
         minDisparity=0,
@@ -39,7 +39,7 @@ def _make_sgbm(mode: int) -> MapMatch:
 
 
 def _make_bm() -> MapMatch:
-    """Create a block matcher over 192 disparities: the same sample's settings, speckle range 2."""
+    """Create a block matcher over 192 disparities, with the sample's settings but a speckle range of 2."""
     matcher = cv2.StereoBM.create(numDisparities=DISPARITIES, blockSize=9)
     matcher.setPreFilterCap(31)
     matcher.setTextureThreshold(10)
@@ -58,7 +58,7 @@ OPENCV_MATCHERS: dict[str, Callable[[], MapMatch]] = {
     "sgbm_3_way": partial(_make_sgbm, cv2.STEREO_SGBM_MODE_SGBM_3WAY),
     "bm": _make_bm,
 }
-"""Matcher name to factory."""
+"""Factories of OpenCV's matchers, by name."""
 
 
 def fill_rows(disparity_px: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
@@ -79,9 +79,9 @@ def fill_rows(disparity_px: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "
 def left_right_confidence(
     disparity_px: Float32[np.ndarray, "h w"], right_disparity_px: Float32[np.ndarray, "h w"]
 ) -> Float32[np.ndarray, "h w"]:
-    """Negated left-right disagreement in px: 0 at best; a ranking, not a probability.
+    """Return the negated left-right disagreement in px: 0 at best; a ranking, not a probability.
 
-    Minus infinity where either disparity is a hole (<= 0) or the match lies outside the right view.
+    It is minus infinity where either disparity is a hole (<= 0) or the match lies outside the right view.
     """
     width = disparity_px.shape[1]
     matches = np.rint(np.arange(width) - disparity_px).astype(int)
@@ -93,7 +93,7 @@ def left_right_confidence(
 def _compute_padded(
     matcher: cv2.StereoMatcher, left: UInt8[np.ndarray, "h w *c"], right: UInt8[np.ndarray, "h w *c"]
 ) -> Float32[np.ndarray, "h w"]:
-    # OpenCV leaves the first 192 columns empty, so pad the left border by as many.
+    # OpenCV leaves the first 192 columns empty, so pad the left border by that many.
     left, right = (
         cv2.copyMakeBorder(image, 0, 0, DISPARITIES, 0, cv2.BORDER_REPLICATE) for image in (left, right)
     )
@@ -103,7 +103,7 @@ def _compute_padded(
 def _find_last_known(
     values: Float32[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"]
 ) -> Float32[np.ndarray, "h w"]:
-    """Nearest known value at or before each pixel in its row; infinity if there is none."""
+    """Return the nearest known value at or to the left of each pixel; infinity if there is none."""
     columns = np.maximum.accumulate(np.where(known, np.arange(values.shape[1]), -1), axis=1)
     last = np.take_along_axis(values, np.maximum(columns, 0), axis=1)
     return np.where(columns >= 0, last, np.float32(np.inf))

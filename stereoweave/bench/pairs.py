@@ -1,4 +1,4 @@
-"""Benchmark of matchers on pairs of known disparity: accuracy, edges, confidence, time and memory."""
+"""Benchmark of matchers on pairs with known disparity: accuracy, edges, confidence, time and memory."""
 
 import platform
 import time
@@ -43,10 +43,10 @@ from stereoweave.stereo import Estimate, StereoPair
 from stereoweave.system.ray_engine import Engine, stream
 
 MatchFunction = Callable[[StereoPair], Estimate | Float[np.ndarray, "h w"]]
-"""The timed function: a pair to an Estimate, or to the left disparity alone, in px [H, W], <= 0 in holes.
+"""The timed function, which returns an Estimate or only the left disparity in px [H, W], <= 0 in holes.
 
-Holes of such a map are then filled along rows, and its confidence comes from the left-right check, for which
-the mirrored pair is matched too. Neither step is timed, because users choose other methods at other costs.
+Holes of such a map are then filled along rows. Its confidence comes from the left-right check, for which the
+mirrored pair is matched too. Neither step is timed, because users may choose methods of other costs.
 """
 
 MatcherFactory = Callable[[], MatchFunction]
@@ -79,7 +79,7 @@ class PairScores(NamedTuple):
 
 @dataclass(frozen=True)
 class SceneResult(Generic[AnyResult]):
-    """A scene's number and result, and the machine that measured it."""
+    """The result of one scene, with the scene's number and the machine that measured it."""
 
     number: int
     result: AnyResult
@@ -87,7 +87,7 @@ class SceneResult(Generic[AnyResult]):
 
 
 class _SceneScores(NamedTuple):
-    """One scene's part of `PairScores`."""
+    """Scores of one scene, which become part of `PairScores`."""
 
     scored: list[tuple[MatcherRow, Curves]]
     class_rows: list[ClassRow]
@@ -103,7 +103,7 @@ class _MatcherOutput(NamedTuple):
 def make_matcher(
     model: str | Path, threads: int | None = None, refined: bool = False, provider: str = CPU
 ) -> MatchFunction:
-    """Return `stereoweave.estimate` with these settings; raises as `Matcher` does."""
+    """Return a function that matches as `stereoweave.estimate` does; raises as `Matcher` does."""
     matcher = Backend(model=model, threads=threads, provider=provider).matcher()
     options = MatchOptions(refined=refined)
     return lambda pair: match(matcher, pair, options)
@@ -112,17 +112,17 @@ def make_matcher(
 def score_pairs(
     makers: Mapping[str, MatcherFactory], scenes: SceneLister[Scene], engine: Engine | None = None
 ) -> PairScores:
-    """Measure errors, times and sparsification curves of the given matchers and OpenCV's on scenes.
+    """Score the given matchers and OpenCV's on scenes: errors, times and sparsification curves.
 
     Args:
-        makers: Makes each matcher, by name.
+        makers: Factories of the matchers, by name.
         scenes: Must list at least one scene.
         engine: Scores each scene on one worker, so that times are compared on one machine; the makers and
             `scenes` are pickled for it. Default: this process.
 
     Raises:
-        StereoweaveError: A matcher's name, or its file's stem, is reserved by the table; no scenes; or any
-            error of `engine.stream`.
+        StereoweaveError: If a matcher's name, or the stem of its file, is that of another row of the table,
+            if there are no scenes, or as `engine.stream` does.
     """
     everyone = _add_opencv(makers)
     found = score_all(everyone, scenes, _score_scene, engine)
@@ -145,12 +145,13 @@ def score_all(
     score: Callable[[Mapping[str, Any], AnyScene], AnyResult],
     engine: Engine | None,
 ) -> list[SceneResult[AnyResult]]:
-    """Apply `score` to the made matchers and each scene; results are in the scenes' order.
+    """Apply `score` to the matchers and each scene. Returns the results in the order of the scenes.
 
     For arguments and errors see `score_pairs`.
     """
     make_scorer = partial(_SceneScorer, makers, scenes, score)
-    scorer = make_scorer()  # always made here too, so that unknown matchers and scenes raise here
+    # Made here even with an engine, so that unknown matchers and scenes raise at once.
+    scorer = make_scorer()
     count = len(scorer.readers)
     if not count:
         raise StereoweaveError("scenes: expected at least one, found none")
@@ -172,7 +173,7 @@ def add_memory(
 
     Args:
         rows: Rows of `score_pairs`.
-        makers: The makers given to `score_pairs`; each must be picklable.
+        makers: The factories given to `score_pairs`; each must be picklable.
         pair: The pair to match; use the largest.
     """
     everyone = _add_opencv(makers)
@@ -183,7 +184,7 @@ def add_memory(
 
 
 class _SceneScorer:
-    """Scores scenes by number; makes the matchers once."""
+    """Scorer of scenes by number, which makes the matchers only once."""
 
     def __init__(
         self,
@@ -196,8 +197,9 @@ class _SceneScorer:
         self.readers, self.score = scenes(), score
         if expected not in (None, len(self.readers)):
             raise StereoweaveError(
-                f"{platform.node()}: expected the same {expected} scenes as where the command was started, "
-                f"found {len(self.readers)}; put them on a disk that every node of the cluster sees"
+                f"{platform.node()}: expected the same {expected} scenes as on the machine that started the "
+                f"command, found {len(self.readers)}; put them on a disk that every node of the cluster can "
+                f"read"
             )
 
     def __call__(self, number: int) -> SceneResult[Any]:
@@ -207,7 +209,7 @@ class _SceneScorer:
 def _add_opencv(makers: Mapping[str, MatcherFactory]) -> dict[str, MatcherFactory]:
     for name in makers:
         if Path(name).stem in (*OPENCV_MATCHERS, MEAN):
-            raise StereoweaveError(f"{name}: expected a name that no other row of the table has; rename it")
+            raise StereoweaveError(f"{name}: expected a name that no other row of the table uses; rename it")
     return {**OPENCV_MATCHERS, **makers}
 
 
@@ -256,7 +258,7 @@ def _run_matcher(match: MatchFunction, pair: StereoPair) -> _MatcherOutput:
 
 
 def _measure_errors(answer: _MatcherOutput, truth_px: Float[np.ndarray, "h w"]) -> dict[str, float]:
-    """Compute the columns that compare with the truth pixel by pixel."""
+    """Return the columns that compare the disparity with the truth pixel by pixel."""
     found_px = answer.disparity_px
     known = np.isfinite(truth_px)
     hits = np.abs(found_px - truth_px)[known] <= 1

@@ -23,7 +23,7 @@ _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#
 _TITLES = {"bad1_percent": "bad-1: off by over 1 px, % of pixels", "epe_px": "EPE: mean error, px"}
 _MARKER_PX = 8
 _Place = tuple[tuple[float, float], Literal["left", "center", "right"], Literal["top", "center", "bottom"]]
-# Places of a label beside its point, the best first: offset in points, and alignment.
+# Places of a label beside its point, best first, each with an offset in points and an alignment.
 _PLACES: tuple[_Place, ...] = (
     ((0, 6), "center", "bottom"),
     ((0, -6), "center", "top"),
@@ -36,7 +36,7 @@ def draw_error_over_time(path: str | Path, rows: Sequence[MatcherRow]) -> None:
     """Write plots of bad-1 and EPE against the time per pair, side by side; lower and further left is better.
 
     Args:
-        path: The picture to write; its ending chooses the format.
+        path: Picture to write; its extension selects the format.
         rows: The mean row of each matcher. Rows whose error is NaN are left out.
     """
     rows = [row for row in rows if not math.isnan(row.epe_px)]
@@ -45,7 +45,7 @@ def draw_error_over_time(path: str | Path, rows: Sequence[MatcherRow]) -> None:
         for row in rows:
             axes.plot(row.time_ms, getattr(row, column), **_choose_marker(row))
         highest = max((getattr(row, column) for row in rows), default=1)
-        axes.set(xscale="log", xlabel="time a pair, ms", ylabel=_TITLES[column], ylim=(0, 1.15 * highest))
+        axes.set(xscale="log", xlabel="time per pair, ms", ylabel=_TITLES[column], ylim=(0, 1.15 * highest))
         axes.margins(x=0.15)
         axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axes.xaxis.set_major_formatter(FormatStrFormatter("%g"))
@@ -58,10 +58,10 @@ def draw_error_over_time(path: str | Path, rows: Sequence[MatcherRow]) -> None:
 
 
 def draw_sparsification(path: str | Path, curves: Mapping[str, Curves]) -> None:
-    """Write plots of bad-1 and EPE against the share of pixels dropped by confidence; dashed: the oracle's.
+    """Write plots of bad-1 and EPE against the share of pixels dropped by confidence, with dashed oracles.
 
     Args:
-        path: The picture to write; its ending chooses the format.
+        path: Picture to write; its extension selects the format.
         curves: Curves of `score_pairs`, by matcher.
     """
     figure, panels = _make_panels()
@@ -102,7 +102,7 @@ def _legend_entry(matcher: str) -> str:
 
 
 def _label(axes: Axes, points: Mapping[str, tuple[float, float]]) -> None:
-    """Write each name beside its point, in the first place free of points and other names, if any."""
+    """Write each name beside its point, in its first free place, or in the best one if none is free."""
     corners = [axes.transData.transform(point) for point in points.values()]
     taken = [Bbox([corner - _MARKER_PX / 2, corner + _MARKER_PX / 2]) for corner in corners]
     for name, point in points.items():

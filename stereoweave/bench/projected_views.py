@@ -1,9 +1,9 @@
-"""Comparison of methods on one dataset: errors of depth, and of the right view projected with it.
+"""Comparison of methods on one dataset: errors of disparity, and of the right view projected with it.
 
 These are the columns of Table I of "Fast Depth Estimation for View Synthesis". The paper does not say how its
 view error treats pixels without a source, and a bad disparity can leave many of them. So the error is given
-twice: over the pixels that have a source, with their share, and over all pixels after the same row fill for
-all methods. The second one ranks the methods.
+twice: over the pixels that have a source, with their share, and over all pixels after rows are filled in the
+same way for all methods. The second error ranks the methods.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -19,7 +19,7 @@ from stereoweave.errors import StereoweaveError
 from stereoweave.stereo import Sample, StereoPair, View
 
 DisparityMethod = Callable[[Sample], Float[np.ndarray, "h w"]]
-"""A sample to its left view's disparity in px [H, W]."""
+"""Returns the left disparity of a sample, in px [H, W]."""
 
 GROUND_TRUTH, NO_WARPING = "ground truth", "no warping"
 
@@ -29,9 +29,9 @@ class ProjectionErrors:
     """Errors of a projected right view against the right image.
 
     Attributes:
-        mae_sourced: Mean absolute error, 0 to 255, over the pixels that have a source.
+        mae_sourced: Mean absolute error, in levels of 0..255, over the pixels that have a source.
         sourced_percent: Share of these pixels.
-        mae_filled: Mean absolute error, 0 to 255, over all pixels after `fill_from_rows`; rank by this one.
+        mae_filled: The same over all pixels after `fill_from_rows`; ranks the methods.
         psnr_db, ssim: Scores of the filled view.
     """
 
@@ -44,7 +44,7 @@ class ProjectionErrors:
 
 @dataclass(frozen=True, kw_only=True)
 class ProjectionRow:
-    """One method's errors of disparity and its `ProjectionErrors`, averaged over the samples.
+    """Disparity errors and `ProjectionErrors` of one method, averaged over the samples.
 
     Attributes:
         epe_px: End-point error over the pixels of known truth.
@@ -67,22 +67,24 @@ def score_projections(
 ) -> list[ProjectionRow]:
     """Return a mean row for each of three baselines, then for each given method.
 
-    The baselines: "ground truth" uses the true disparity and leaves pixels without a source where that is
-    unknown; "no warping" has disparity 0, so its right view is the left image; "sgbm" is OpenCV's matcher
-    with holes filled along rows.
+    The baseline "ground truth" uses the true disparity; where it is unknown, pixels have no source. "no
+    warping" uses disparity 0, so its right view is the left image. "sgbm" is OpenCV's matcher with holes
+    filled along rows.
 
     Args:
         methods: Further methods, by name.
         samples: Pairs of known disparity.
-        max_depth_m: Estimated depth is clamped to this before comparison, because one pixel at infinity would
-            make the mean infinite. Default: each sample's greatest true depth.
+        max_depth_m: Maximum to which estimated depth is clamped before comparison, because one pixel at
+            infinity would make the mean infinite. Default: each sample's greatest true depth.
 
     Raises:
-        StereoweaveError: A method has a baseline's name, or there are no samples.
+        StereoweaveError: If a method has the name of a baseline, or there are no samples.
     """
     everyone: dict[str, DisparityMethod] = {GROUND_TRUTH: _true_px, NO_WARPING: _zero_px, SGBM: _make_sgbm()}
     if taken := everyone.keys() & methods.keys():
-        raise StereoweaveError(f"{min(taken)}: expected a name that no other row of the table has; rename it")
+        raise StereoweaveError(
+            f"{min(taken)}: expected a name that no other row of the table uses; rename it"
+        )
     everyone |= methods
     scores = [
         {name: _score_sample(method(sample), sample, max_depth_m) for name, method in everyone.items()}

@@ -1,8 +1,8 @@
 """Projection of the left image to the right view.
 
 Used for Table I of "Fast Depth Estimation for View Synthesis". `rendering` makes better views, from both
-images. This projection only compares methods: it neither blends nor refines, so that two methods' views
-differ by their disparity alone.
+images. This projection only serves to compare methods: it neither blends nor refines, so the views of two
+methods differ only by their disparity.
 """
 
 import numpy as np
@@ -16,7 +16,7 @@ def project_right(left: UInt8[np.ndarray, "h w 3"], disparity_px: Float[np.ndarr
     """Project the left image to the right view; pixels without a source are black and not `drawn`.
 
     Column x of the left image goes to the right image's column nearest to x - disparity_px. Where several
-    pixels land on one, the nearest surface wins. The paper only says "projected from the left images".
+    pixels land together, the nearest surface wins. The paper only says "projected from the left images".
 
     Args:
         left: uint8 RGB [H, W, 3].
@@ -31,13 +31,13 @@ def project_right(left: UInt8[np.ndarray, "h w 3"], disparity_px: Float[np.ndarr
     inside = (landed >= 0) & (landed < left.shape[1])
     target = np.nonzero(inside)[0], landed[inside].astype(np.intp)
     image, drawn = np.zeros_like(left), np.zeros(disparity_px.shape, bool)
-    # Of two pixels that land together, the nearer came from farther right; written last, it stays.
+    # Of two pixels that land together, the nearer comes from farther right, so it is written last.
     image[target], drawn[target] = left[inside], True
     return View(image=image, drawn=drawn)
 
 
 def fill_from_rows(view: View) -> UInt8[np.ndarray, "h w 3"]:
-    """Fill each pixel that was not drawn with the next drawn pixel to its right, else the last to its left.
+    """Fill each pixel that was not drawn with the next drawn pixel on its right, else the last on its left.
 
     In a right view projected from the left image, nearer surfaces move farther left, so the area that they
     uncover has background on its right. The fill therefore needs no disparity and treats all methods alike. A

@@ -1,4 +1,4 @@
-"""Rows of the benchmark of pairs, their means over scenes, and CSV files of rows."""
+"""Rows of the pairs benchmark, their means over scenes, and CSV files of rows."""
 
 import os
 import platform
@@ -23,8 +23,8 @@ MEAN = "mean"
 class MatcherRow:
     """Scores of one matcher on one scene, or averaged over all scenes (scene "mean").
 
-    Errors cover every pixel of known truth, occluded ones included. A mean is over the scenes that have the
-    number; a scene without a depth edge has no edge errors, for example.
+    Errors cover every pixel of known truth, occluded ones included. A mean is over the scenes that have a
+    value; for example, a scene without depth edges has no edge errors.
 
     Attributes:
         edge_epe_px, edge_bad1_percent, flying_percent: Errors near depth edges (edge_metrics.py).
@@ -33,7 +33,7 @@ class MatcherRow:
         calibration_error: Expected calibration error; NaN for the left-right check, which gives no
             probability. It is computed per scene, so that overconfidence in one scene does not cancel
             underconfidence in another.
-        time_ms: Median of the warm calls; in the mean row, the mean of these medians.
+        time_ms: Median time per call after a warm-up; in the mean row, the mean of these medians.
         time_relative: time_ms as a multiple of SGBM's in the same scene.
         memory_mb: Peak memory for the largest pair (memory.py); only in the mean row, and if measured.
     """
@@ -62,8 +62,8 @@ class ClassRow:
     Attributes:
         pixel_class: A name in `error_classes.CLASSES`, or `error_classes.ALL`.
 
-    The other columns are those of `ClassErrors`. A mean is over the scenes that have the number; a scene
-    without plain pixels has no error within that class, for example.
+    The other columns are those of `ClassErrors`. A mean is over the scenes that have a value; for
+    example, a scene without plain pixels has no error within that class.
     """
 
     matcher: str
@@ -78,7 +78,7 @@ class ClassRow:
 
 
 class Curves(NamedTuple):
-    """A matcher's sparsification curves: of the mean error in px, and of bad-1 in percent."""
+    """A matcher's sparsification curves, for the mean error in px and for bad-1 in percent."""
 
     epe_px: Sparsification
     bad1_percent: Sparsification
@@ -100,7 +100,7 @@ def average_rows(rows: list[MatcherRow], names: Iterable[str]) -> list[MatcherRo
 
 
 def average_class_rows(rows: Sequence[ClassRow]) -> list[ClassRow]:
-    """Average over the scenes, in the order of the first scene's rows."""
+    """Return mean rows over the scenes, one per matcher and class, in the order of the first scene's rows."""
     by_class: defaultdict[tuple[str, str], list[ClassRow]] = defaultdict(list)
     for row in rows:
         by_class[row.matcher, row.pixel_class].append(row)
@@ -117,7 +117,7 @@ def average_class_rows(rows: Sequence[ClassRow]) -> list[ClassRow]:
 
 
 def average_curves(curves: Sequence[Curves]) -> Curves:
-    """Return the mean curves over the scenes."""
+    """Return the curves averaged over the scenes."""
     means = (
         Sparsification(*(_average_known(lines) for lines in zip(*of_scenes, strict=True)))
         for of_scenes in zip(*curves, strict=True)
@@ -126,7 +126,7 @@ def average_curves(curves: Sequence[Curves]) -> Curves:
 
 
 def write_csv(path: str | Path, rows: Sequence[Any], machine: dict[str, str] | None = None) -> None:
-    """Write the rows as CSV with a header and the machine's columns.
+    """Write rows as CSV with a header, and with the machine's columns in each row.
 
     Args:
         path: The CSV file; its folder is created.
@@ -145,13 +145,13 @@ def describe_machine() -> dict[str, str]:
 
 
 def _average_known(values: Sequence[Any]) -> Any:
-    """Mean of the numbers or equal-shaped arrays without NaN; NaN if there are none."""
+    """Return the mean of the numbers, or of the arrays of equal shape, without NaN; NaN if all have NaN."""
     known = [value for value in values if not np.isnan(value).any()]
     return np.mean(known, axis=0) if known else values[0]
 
 
 def _find_cpu_name() -> str:
-    # Only Linux has this file, and there platform.processor() does not return the model.
+    # Only Linux has this file; platform.processor() does not return the model on Linux.
     about = Path("/proc/cpuinfo")
     lines = about.read_text().splitlines() if about.exists() else []
     models = [line.split(": ", 1)[1] for line in lines if line.startswith("model name")]

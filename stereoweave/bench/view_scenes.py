@@ -21,12 +21,12 @@ from stereoweave.stereo import Sample, StereoPair
 
 @dataclass(frozen=True, kw_only=True)
 class ReferenceView:
-    """An image taken by a further camera on the line through the two.
+    """An image taken by a further camera on the line through the two cameras of the pair.
 
     Attributes:
         position: 0 is the left camera, 1 the right one.
         image: uint8 RGB [H, W, 3].
-        offset_px: Offset of its content right of and below the nominal place.
+        offset_px: Offset of the image's content from its nominal place, to the right and down.
     """
 
     position: float
@@ -50,23 +50,23 @@ class ViewScene:
 
 
 def read_view_scenes(folder: str | Path) -> Iterator[ViewScene]:
-    """Iterate over the scenes of `folder` in order of name, reading each lazily; see `list_view_scenes`."""
+    """Yield the scenes of `folder` in order of name, each read when it is needed; see `list_view_scenes`."""
     return (read() for read in list_view_scenes(folder))
 
 
 def list_view_scenes(folder: str | Path) -> list[Callable[[], ViewScene]]:
     """Return a reader for each scene of `folder`, sorted by the scenes' names.
 
-    A scene is a folder of left.png, right.png and view_<position>.png for each further picture. It may have
-    disparity.png (16 bit, pixels * 256, 0 = unknown) or disparity.pfm (NaN or infinity = unknown), the same
-    for right_disparity, and scene.json, whose "offset_px" {position: [right, down]} gives each picture's
-    offset from its nominal place. Without such folders, the scenes are the pairs with further views of all
-    rendered sets (`stereoweave synth make`) in and below `folder`.
+    A scene is a folder with left.png, right.png and a view_<position>.png for each further picture. It may
+    also have disparity.png (16 bits, pixels * 256, 0 = unknown) or disparity.pfm (NaN or infinity = unknown),
+    and right_disparity in the same formats. An optional scene.json gives each picture's offset from its
+    nominal place as "offset_px": {position: [right, down]}. Without such folders, the scenes are the pairs of
+    all rendered sets (`stereoweave synth make --view`) in and below `folder`.
 
     Raises:
-        StereoweaveError: No scene in the folder.
-        FormatError: Raised by a reader if a file is missing, damaged or of a different size, a position is
-            not a number or out of range, or there is no further picture.
+        StereoweaveError: If the folder contains no scene.
+        FormatError: Raised by a reader if a file is missing, damaged or of a different size, if a position is
+            not a number or out of range, or if there is no further picture.
     """
     root = Path(folder)
     if scenes := sorted(left.parent for left in root.glob("*/left.png")):
@@ -76,7 +76,7 @@ def list_view_scenes(folder: str | Path) -> list[Callable[[], ViewScene]]:
     if not sets:
         raise StereoweaveError(
             f"{root}: expected <scene>/left.png below it, or rendered sets, found neither; "
-            "render a set with further views: stereoweave synth make"
+            "render a set with further views: stereoweave synth make --view"
         )
     return [
         partial(_read_rendered_scene, pairs, index, root) for pairs in sets for index in range(pairs.count)
@@ -89,8 +89,8 @@ def _read_rendered_scene(pairs: Shards, index: int, root: Path) -> ViewScene:
     views = tuple(ReferenceView(position=at, image=image) for at, image in sorted(pairs.views(index).items()))
     if not views:
         raise FormatError(
-            f"{folder}: expected pairs with further views, found {name} without; "
-            "render a set with further views: stereoweave synth make"
+            f"{folder}: expected further views of every pair, found none of {name}; "
+            "render a set with further views: stereoweave synth make --view"
         )
     return ViewScene(name=name, sample=pairs[index], views=views)
 
@@ -125,14 +125,14 @@ def _parse_position(path: Path) -> float:
         position = float("nan")
     if not FIRST_POSITION <= position <= LAST_POSITION:
         raise FormatError(
-            f"{path}: expected view_<position>.png, a position of {FIRST_POSITION:g} to {LAST_POSITION:g} "
-            f"(0 left camera, 1 right), found {text!r}"
+            f"{path}: expected view_<position>.png with a position of {FIRST_POSITION:g} to "
+            f"{LAST_POSITION:g} (0 is the left camera, 1 the right one), found {text!r}"
         )
     return position
 
 
 def _read_disparity(folder: Path, name: str, *, pair: StereoPair) -> Float[np.ndarray, "h w"]:
-    """Read the named disparity, PFM or else PNG; NaN (unknown) everywhere without a file."""
+    """Read the named disparity from PFM or else PNG; all NaN (unknown) if neither file exists."""
     readers: dict[str, Callable[[Path], Float[np.ndarray, "h w"]]] = {
         ".pfm": read_pfm,
         ".png": read_disparity_png,

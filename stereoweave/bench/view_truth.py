@@ -1,4 +1,4 @@
-"""Ground truth of a new view of a known pair: its disparity, and which pixels the two cameras see."""
+"""Ground truth of a new view of a known pair: disparity, and how many cameras see each pixel."""
 
 from dataclasses import dataclass
 
@@ -9,9 +9,9 @@ from stereoweave.bench.opencv_matchers import fill_rows
 from stereoweave.data.samples import find_occluded
 from stereoweave.stereo import Sample
 
-# Neighbours up to this far apart are one surface. A larger step is an edge, as in edge_metrics.py.
+# Neighbours whose disparities differ by at most this are one surface; a larger step is a depth edge.
 _JOINED_PX = 2.0
-# Sampling of one surface, so that the view's magnification, at most 3 between the cameras, leaves no cracks.
+# Samples per pixel of a surface, without cracks in a view between the cameras, which magnifies up to 3 times.
 _SAMPLES_A_PIXEL = 4
 
 
@@ -23,7 +23,7 @@ class ViewTruth:
         disparity_px: Disparity between the left and the right image of the surface in each pixel; NaN where
             no pixel of known disparity lands.
         one_sees: Mask of pixels of known disparity that only one of the two images shows.
-        none_sees: Mask of pixels that neither image shows, unknown disparity filled by `fill_unknown`.
+        none_sees: Mask of pixels that neither image shows, after `fill_unknown` has filled unknown disparity.
     """
 
     disparity_px: Float[np.ndarray, "h w"]
@@ -32,7 +32,7 @@ class ViewTruth:
 
 
 def find_view_truth(sample: Sample, position: float) -> ViewTruth:
-    """Compute a view's ground truth: the nearest surface that lands on each pixel from either image.
+    """Return a view's ground truth: the nearest surface that lands on each pixel from either image.
 
     Args:
         sample: Needs both disparities; pixels of unknown disparity never count as occluded.
@@ -48,11 +48,11 @@ def find_view_truth(sample: Sample, position: float) -> ViewTruth:
 
 
 def land_disparities(disparity_px: Float[np.ndarray, "h w"], way: float) -> Float[np.ndarray, "h w"]:
-    """Return the nearest surface's disparity on each pixel of a view [H, W]; NaN where nothing lands.
+    """Return the disparity of the nearest surface at each pixel of a view [H, W]; NaN where nothing lands.
 
     Args:
         disparity_px: Disparity of an input image; NaN is unknown.
-        way: Column x lands on the pixel nearest to x + way * disparity_px.
+        way: Shift per disparity: column x lands on the pixel nearest to x + way * disparity_px.
     """
     height, width = disparity_px.shape
     landed = np.full((height, width), -np.inf, np.float32)
@@ -77,7 +77,8 @@ def fill_unknown(disparity_px: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h
 def _find_occluded_from(
     disparity_px: Float[np.ndarray, "h w"], side_px: Float[np.ndarray, "h w"], way: float
 ) -> Bool[np.ndarray, "h w"]:
-    """Find the new view's pixels that are occluded in the side image; for `way` see `land_disparities`."""
-    if way < 0:  # the image was taken to the left; mirrored, to the right
+    """Return the mask of the view's pixels that one image does not show; for `way` see `land_disparities`."""
+    if way < 0:
+        # The image was taken to the left of the view; after mirroring, it lies to the right.
         return _find_occluded_from(disparity_px[:, ::-1], side_px[:, ::-1], -way)[:, ::-1]
     return find_occluded(way * disparity_px, way * side_px)

@@ -1,12 +1,12 @@
 """Scores of new views against reference images from the same position, by method and by kind of pixel.
 
-The methods only see the two input images. If both true disparities are known, the pixels at the reference's
-nominal position are classified by the new view's ground truth (view_truth.py):
+The methods see only the two input images. If both true disparities are known, pixels are classified by the
+ground truth of the view at the reference's nominal position (view_truth.py):
 
-    smooth    known disparity, more than three pixels from a depth edge
-    edge      known disparity, within three pixels of one (edge_metrics.py)
+    smooth    known disparity, more than three pixels from any depth edge
+    edge      known disparity, within three pixels of a depth edge (edge_metrics.py)
     one       smooth or edge, and seen by only one of the two cameras
-    neither   seen by neither camera, so of unknown disparity
+    neither   seen by neither camera, and therefore of unknown disparity
 """
 
 import time
@@ -32,10 +32,10 @@ from stereoweave.stereo import Estimate, Sample, StereoPair
 from stereoweave.system.ray_engine import Engine
 
 Estimator = Callable[[StereoPair], Estimate]
-"""A pair to the estimate that views are rendered from."""
+"""Returns the estimate of a pair, from which views are rendered."""
 
 Viewer = Callable[[float], UInt8[np.ndarray, "h w 3"]]
-"""A position to the view of one scene by one method."""
+"""Returns one method's view of one scene from a position."""
 
 _BEHIND_ALL_PX = -1e9
 NEAREST, CROSS_FADE, GROUND_TRUTH = "nearest photograph", "cross-fade", "ground truth"
@@ -45,15 +45,15 @@ NEAREST, CROSS_FADE, GROUND_TRUTH = "nearest photograph", "cross-fade", "ground 
 class ViewScoreRow:
     """Scores of one method's view of a scene from one position against the reference image.
 
-    In a method's mean row (scene "mean", no position) each number is averaged over a scene's positions that
-    have it, then over the scenes that have it.
+    In a method's mean row (scene "mean", position NaN), each score is averaged first over the positions of a
+    scene, then over the scenes; NaN scores are left out.
 
     Attributes:
-        psnr_db, ssim, mae: Over all pixels; errors are in grey levels of 0..255.
+        psnr_db, ssim, mae: Scores over all pixels; mae is in levels of 0..255.
         smooth_psnr_db, edge_psnr_db, one_psnr_db, neither_psnr_db: PSNR over the pixels of one kind (see the
-            module); NaN if there are none or the truth is unknown.
+            list above); NaN if there are none or the truth is unknown.
         smooth_mae, edge_mae, one_mae, neither_mae: Mean absolute error over the same pixels.
-        time_ms: Median time per view once the pair is matched.
+        time_ms: Median time per view, without the matching of the pair.
     """
 
     scene: str
@@ -74,7 +74,7 @@ class ViewScoreRow:
 
 
 class ViewScores(NamedTuple):
-    """A row per scene, position and method, then a mean row per method; and the machine's description."""
+    """Rows per scene, position and method, then a mean row per method, and a description of the machine."""
 
     rows: list[ViewScoreRow]
     machine: dict[str, str]
@@ -89,14 +89,15 @@ def score_view_scenes(
     """Score the views of several methods against reference images.
 
     Every table has four baselines. "nearest photograph" and "cross-fade", the weighted mean of both images,
-    need no disparity. "sgbm" is OpenCV's matcher. "ground truth" is the true disparity of both views, where
-    known: the upper bound. Both are filled along rows and rendered like the networks' estimates.
+    need no disparity. "sgbm" uses the disparity of OpenCV's matcher. "ground truth" uses the true disparity
+    of both views, where known, and is an upper bound. Both disparities are filled along rows, and rendered
+    like the networks' estimates.
 
     Args:
-        networks: Makes each further method, by name.
+        networks: Factories of further methods, by name.
         scenes: Must list at least one scene.
         threads: Threads for rendering; default: all cores.
-        engine: See `score_pairs`, for errors too.
+        engine: See `score_pairs`, also for the errors raised.
     """
     found = score_all(networks, scenes, partial(_score_scene, threads), engine)
     rows = [row for scene in found for row in scene.result]
@@ -108,7 +109,7 @@ def score_view_scenes(
 def shift_image(
     image: UInt8[np.ndarray, "h w 3"], offset_px: tuple[float, float]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Shift the image's content right and down by offset_px; unchanged if that is zero."""
+    """Shift an image's content to the right and down by offset_px; an offset of zero changes nothing."""
     if offset_px == (0, 0):
         return image
     shift = np.array([[1, 0, offset_px[0]], [0, 1, offset_px[1]]], np.float32)
@@ -168,7 +169,7 @@ def _render_view(renderer: Renderer, position: float) -> UInt8[np.ndarray, "h w 
 
 
 def _estimate_by_sgbm(pair: StereoPair) -> Estimate:
-    """Match both views with SGBM and fill each along rows; the confidence is the left-right check's."""
+    """Match both views with SGBM, fill holes along rows, and take confidence from the left-right check."""
     match = OPENCV_MATCHERS[SGBM]()
     left_px, mirrored_px = match(pair), match(pair.mirror())
     filled_px, right_filled_px = fill_rows(left_px), fill_rows(mirrored_px)[:, ::-1]
@@ -195,7 +196,7 @@ def _has_truth(sample: Sample) -> bool:
 
 
 def _classify_pixels(sample: Sample, position: float) -> dict[str, Bool[np.ndarray, "h w"]]:
-    """Return a mask per kind of pixel, by the prefix of its columns; empty if the truth is unknown."""
+    """Return a mask per kind of pixel, by the prefix of its columns; all False if the truth is unknown."""
     if not _has_truth(sample):
         return dict.fromkeys(("smooth", "edge", "one", "neither"), np.zeros(sample.left.shape[:2], bool))
     truth = find_view_truth(sample, position)
@@ -208,7 +209,7 @@ def _classify_pixels(sample: Sample, position: float) -> dict[str, Bool[np.ndarr
 def _measure_errors(
     image: UInt8[np.ndarray, "h w 3"], true: ReferenceView, kinds: Mapping[str, Bool[np.ndarray, "h w"]]
 ) -> dict[str, float]:
-    """Compute the columns that compare the two images."""
+    """Return the columns that compare the two images."""
     errors = {
         "psnr_db": psnr_db(image, true.image),
         "ssim": ssim(image, true.image),

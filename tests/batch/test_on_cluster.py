@@ -158,8 +158,8 @@ def test_a_machine_that_sees_other_scenes_is_named(sets):
     with pytest.raises(StereoweaveError) as raised:
         benchmark._SceneScorer({}, partial(list_scenes, sets), len, expected=3)
     assert str(raised.value) == (
-        f"{platform.node()}: expected the same 3 scenes as where the command was started, found 2; "
-        "put them on a disk that every node of the cluster sees"
+        f"{platform.node()}: expected the same 3 scenes as on the machine that started the command, found 2; "
+        "put them on a disk that every node of the cluster can read"
     )
 
 

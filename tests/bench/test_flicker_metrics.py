@@ -71,7 +71,7 @@ def test_flicker_of_no_point_is_nan():
 
 
 def test_frames_of_two_sizes_and_points_that_leave_are_refused(without_shape_checks):
-    with pytest.raises(StereoweaveError, match="of one size, got .*1, 4.*1, 3"):
+    with pytest.raises(StereoweaveError, match="of one size, found .*1, 4.*1, 3"):
         flicker(row(1, 2, 3, 4), row(1, 2, 3), REST, ALL)
     with pytest.raises(StereoweaveError, match="found 1 that leave it"):
         flicker(row(1, 2, 3, 4), row(1, 2, 3, 4), to_the_right(0, 0, 0, 1), ALL)

@@ -85,7 +85,7 @@ def test_a_folder_without_scenes_is_told_apart(tmp_path):
 def test_a_set_without_views_is_named(tmp_path):
     write_shard(tmp_path, "ship", 0, [pack(box_before_a_wall(np.random.default_rng(0)), {})])
     with pytest.raises(
-        FormatError, match="further views, found ship-000000 without; render a set with further"
+        FormatError, match="further views of every pair, found none of ship-000000; render a set with further"
     ):
         next(read_view_scenes(tmp_path))
 
