@@ -1,4 +1,4 @@
-"""The command stereoweave app."""
+"""The command `stereoweave app`."""
 
 from typing import Annotated
 
@@ -13,7 +13,10 @@ OpenBrowser = Annotated[bool, typer.Option("--open/--no-open", help="Open the pa
 def app(
     host: Host = "127.0.0.1", port: Port = 7860, open_browser: OpenBrowser = False, provider: Provider = "cpu"
 ) -> None:
-    """Serve a web page: upload a pair, see depth and views, rotate the point cloud, measure, download."""
+    """Serve a web page that shows depth and views of uploaded pairs.
+
+    The page also rotates point clouds, measures distances and offers all results for download.
+    """
     from stereoweave.matching.providers import check_provider
 
     check_provider(provider)

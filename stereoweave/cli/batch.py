@@ -1,4 +1,4 @@
-"""The command stereoweave batch."""
+"""The command `stereoweave batch`."""
 
 from typing import Annotated
 
@@ -24,27 +24,29 @@ from stereoweave.cli.options import (
 Source = Annotated[
     str,
     typer.Argument(
-        help="Pairs and stereo videos: a folder, or s3://bucket/folder, gs://bucket/folder, az://…"
+        help="Folder of pairs and stereo videos: a path, or a URL such as s3://bucket/folder, gs://… or "
+        "az://…"
     ),
 ]
 Destination = Annotated[
-    str, typer.Argument(help="Results: a new folder or URL, or that of an interrupted batch.")
+    str, typer.Argument(help="Folder or URL for the results: new, or that of a batch to resume.")
 ]
 Address = Annotated[
     str | None,
     typer.Option(
         help="Ray cluster to run on: host:port or ray://host:port of its head node, auto for one that runs "
-        "on this machine, local for this machine's cores (default: RAY_ADDRESS if set, else local)."
+        "on this machine, or local for this machine's cores (default: RAY_ADDRESS if set, else local)."
     ),
 ]
 Workers = Annotated[
-    int | None, typer.Option(min=1, help="Maximum number of workers (default: as many as the cluster holds).")
+    int | None,
+    typer.Option(min=1, help="Maximum number of workers (default: as many as fit on the cluster)."),
 ]
 CpusEach = Annotated[float, typer.Option(help="CPU cores per worker.")]
-GpusEach = Annotated[float, typer.Option(help="GPUs per worker: with 0.25, four workers share one.")]
+GpusEach = Annotated[float, typer.Option(help="GPUs per worker; with 0.25, four workers share one GPU.")]
 Write = Annotated[
     list[str] | None,
-    typer.Option(metavar="NAME", help="Additional file to write, as for depth; repeatable."),
+    typer.Option(metavar="NAME", help="Additional file to write, as for stereoweave depth. Repeatable."),
 ]
 
 
@@ -68,10 +70,10 @@ def batch(  # noqa: PLR0913 - each is an option of the command line
     provider: Provider = "cpu",
     as_json: AsJson = False,
 ) -> None:
-    """Estimate depth of an archive of pairs and videos, on one machine or a cluster.
+    """Estimate the depth of an archive of pairs and videos.
 
-    The manifest, Parquet files in the results, has a row per pair or video. Rerun the same command to resume
-    after any interruption; it also retries pairs that failed.
+    The batch runs on one machine or on a cluster. The results include a manifest: Parquet files with a row
+    per pair or video. Rerun the same command to resume after any interruption and to retry failed pairs.
     """
     from stereoweave.batch.cluster import run_cluster_command
     from stereoweave.matching.backend import Backend

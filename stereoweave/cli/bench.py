@@ -1,4 +1,4 @@
-"""Commands stereoweave bench pairs | collages | views | flicker | networks | parity | training."""
+"""The commands `stereoweave bench pairs | collages | views | flicker | networks | parity | training`."""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -35,17 +35,17 @@ Classes = Annotated[
     Path | None,
     typer.Option(
         metavar="FILE",
-        help="Second CSV file to write: errors by pixel class (outside the right picture, occluded, near "
-        "edges, plain, weakly textured, textured).",
+        help="Additional CSV file to write: errors by class of pixel (outside the right picture, occluded, "
+        "near edges, plain, weakly textured, textured).",
     ),
 ]
 CsvFile = Annotated[Path, typer.Option("--out", "-o", help="CSV file to write.")]
 Models = Annotated[
     list[str] | None,
-    typer.Option(help="As for depth; repeat for several (default: all shipped networks)."),
+    typer.Option(help="Network, as for stereoweave depth. Repeatable (default: all shipped networks)."),
 ]
 
-bench = Commands("Score matchers, views, videos and trained networks.")
+bench = Commands("Score matchers, new views, videos and trained networks.")
 
 
 @bench.command()
@@ -53,29 +53,41 @@ def pairs(  # noqa: PLR0913 - each is an option of the command line
     folder: Annotated[
         Path,
         typer.Argument(
-            help="One folder per scene, with left.png, right.png and disparity.png; or a set from synth make."
+            help="Folder with a subfolder per scene, which contains left.png, right.png and disparity.png; "
+            "or a "
+            "set made by synth make."
         ),
     ],
     out: CsvFile = Path("pairs.csv"),
     model: Models = None,
     dataset: Annotated[
-        str | None, typer.Option(help="Public dataset in the folder, unpacked as its authors distribute it.")
+        str | None,
+        typer.Option(
+            help="Public dataset that the folder contains, unpacked as its authors distribute it. An unknown "
+            "name lists them all."
+        ),
     ] = None,
     plot: Annotated[
-        Path | None, typer.Option(help="Picture to write: errors against time. Extra 'train'.")
+        Path | None, typer.Option(help="Picture to write: errors against time. Needs the extra 'train'.")
     ] = None,
     sparsification: Annotated[
-        Path | None, typer.Option(help="Picture to write: errors by confidence. Extra 'train'.")
+        Path | None,
+        typer.Option(
+            help="Picture to write: errors of the pixels that remain as the least confident ones are "
+            "dropped. "
+            "Needs the extra 'train'."
+        ),
     ] = None,
     classes: Classes = None,
     cluster: Cluster = None,
     threads: Threads = None,
     provider: Provider = "cpu",
 ) -> None:
-    """Score networks and OpenCV's matchers on known disparity: errors, edges, confidence, time, memory.
+    """Score networks and OpenCV's matchers on known disparity.
 
-    With --cluster, one worker of --threads cores (default: 1) scores each scene, so that times compare with
-    SGBM's. Memory is measured on this machine.
+    Scores cover errors, edges, confidence, time and memory. With --cluster, each scene is scored by one
+    worker with --threads cores (default: 1), so that the times of all matchers on a scene are comparable.
+    Memory is measured on this machine.
     """
     import cv2
 
@@ -109,11 +121,11 @@ def collages(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the set, new or empty.")],
     pairs: Annotated[int, typer.Option(min=1, help="Number of pairs.")] = 16,
     seed: Annotated[
-        int, typer.Option(min=0, help="Seed; the default gives the validation pairs of trainings.")
+        int, typer.Option(min=0, help="Random seed; the default gives the pairs that trainings validate on.")
     ] = 1_000_003,
     size: Annotated[str, typer.Option(help="Width and height in pixels.")] = "384x256",
 ) -> None:
-    """Write held-out collages, painted like the training pairs, as a set for bench pairs."""
+    """Write a set of held-out collages for bench pairs. They are painted like the training pairs."""
     with require_train_extra():
         from stereoweave.learn.data.collage_set import write_collages
     width_px, height_px = parse_size_px(size)
@@ -126,8 +138,8 @@ def views(  # noqa: PLR0913 - each is an option of the command line
     folder: Annotated[
         Path,
         typer.Argument(
-            help="One folder per scene, with left.png, right.png and view_<position>.png; or a set from "
-            "synth make --view."
+            help="Folder with a subfolder per scene, which contains left.png, right.png and one or more "
+            "view_<position>.png; or a set made by synth make --view."
         ),
     ],
     out: CsvFile = Path("views.csv"),
@@ -136,9 +148,10 @@ def views(  # noqa: PLR0913 - each is an option of the command line
     threads: Threads = None,
     provider: Provider = "cpu",
 ) -> None:
-    """Score new views against pictures taken there: all pixels, smooth regions, depth edges, occluded pixels.
+    """Score new views against reference pictures.
 
-    With --cluster, one worker of --threads cores (default: 1) scores each scene.
+    Scores cover all pixels, smooth regions, depth edges and occluded pixels. With --cluster, each scene is
+    scored by one worker with --threads cores (default: 1).
     """
     import cv2
 
@@ -160,14 +173,19 @@ def views(  # noqa: PLR0913 - each is an option of the command line
 
 @bench.command()
 def flicker(  # noqa: PLR0913 - each is an option of the command line
-    scenes: Annotated[list[str], typer.Argument(metavar="SCENE...", help="Scene name, as for synth make.")],
+    scenes: Annotated[
+        list[str], typer.Argument(metavar="SCENE...", help="Names of scenes, as for synth make.")
+    ],
     out: CsvFile = Path("flicker.csv"),
     model: Model = "small",
-    frames: Annotated[int, typer.Option(min=2, max=120, help="Frames of each video.")] = 12,
+    frames: Annotated[int, typer.Option(min=2, max=120, help="Number of frames per video.")] = 12,
     threads: Threads = None,
     provider: Provider = "cpu",
 ) -> None:
-    """Score the temporal filter on rendered noisy videos: flicker and errors with and without it."""
+    """Score the temporal filter on rendered videos with noise.
+
+    Flicker and errors are measured with and without the filter.
+    """
     make_parent_folder(out)
     with require_synth_extra():
         from stereoweave.bench.flicker import average_rows, score_flicker
@@ -183,18 +201,22 @@ def flicker(  # noqa: PLR0913 - each is an option of the command line
 def networks(
     runs: Annotated[
         list[Path],
-        typer.Argument(metavar="RUN...", help="Folders of stereoweave train, or checkpoints."),
+        typer.Argument(metavar="RUN...", help="Run folders of stereoweave train, or checkpoints."),
     ],
     out: CsvFile = Path("networks.csv"),
     pairs: Annotated[
         Path | None,
         typer.Option(
             metavar="FOLDER",
-            help="Folder of the kept pairs; missing ones are created (default: pairs, beside the first run).",
+            help="Folder of the held-out pairs; missing ones are created (default: pairs, beside the first "
+            "run).",
         ),
     ] = None,
 ) -> None:
-    """Score trained networks on their held-out pairs, with the errors of right views made from them."""
+    """Score trained networks on their held-out pairs.
+
+    Scores cover disparity, and the right views projected with it.
+    """
     from rich.console import Console
 
     make_parent_folder(out)
@@ -212,7 +234,10 @@ def parity(
     ],
     out: CsvFile = Path("parity.csv"),
 ) -> None:
-    """Compare every variant of shipped networks with PyTorch, on every provider available here."""
+    """Compare variants of shipped networks with PyTorch.
+
+    Every variant runs on every provider that is available on this machine.
+    """
     from stereoweave.bench.tables import write_csv
 
     make_parent_folder(out)
@@ -226,10 +251,13 @@ def parity(
 
 @bench.command()
 def training(
-    run: Annotated[Path, typer.Argument(help="Folder of a run of stereoweave train.")],
+    run: Annotated[Path, typer.Argument(help="Run folder of stereoweave train.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="CSV file to write; rows of other runs are kept.")],
 ) -> None:
-    """Record the learning curve of a run: held-out scores by pairs seen, and the power laws that fit them."""
+    """Record a run's learning curve, and fit power laws to it.
+
+    The curve is held-out scores against the number of pairs seen.
+    """
     make_parent_folder(out)
     with require_train_extra():
         from stereoweave.learn.training.curves import record_curve
@@ -240,7 +268,7 @@ def training(
 def _list_makers(
     models: Sequence[str] | None, threads: int | None, provider: str
 ) -> dict[str, Callable[[], Any]]:
-    """Constructors of the named networks, plain and refined; default: all shipped networks."""
+    """Return factories of the named networks, plain and refined; default: all shipped networks."""
     from stereoweave.bench.pairs import make_matcher
     from stereoweave.matching.matcher import MODES, shipped_models
 

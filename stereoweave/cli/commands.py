@@ -1,4 +1,4 @@
-"""The options of the running command, by which its errors and notes name settings."""
+"""Names of the running command's options, which its errors and notes use for settings."""
 
 from collections.abc import Callable
 from contextvars import ContextVar
@@ -10,7 +10,7 @@ from typer.core import TyperCommand
 
 from stereoweave.errors import NameOf, StereoweaveError, keyword
 
-# Parameters of commands that set a setting of another name.
+# Parameters of commands, by setting, where the two names differ.
 _PARAMETERS = {
     "calibration": "calib",
     "convergence_px": "convergence",
@@ -24,16 +24,16 @@ _PARAMETERS = {
 
 @dataclass(frozen=True)
 class OptionNames:
-    """The `NameOf` of one command; it can be sent to other processes.
+    """The `NameOf` for one command; it can be sent to other processes.
 
     Attributes:
-        options: The command's options by parameter.
+        options: The command's options, by parameter.
     """
 
     options: dict[str, str]
 
     def __call__(self, setting: str) -> str | None:
-        """Return the option for a setting; None if the command has none."""
+        """Return the option that sets a setting; None if the command has none."""
         return self.options.get(setting) or self.options.get(_PARAMETERS.get(setting, ""))
 
 
@@ -47,15 +47,15 @@ _running: ContextVar[NameOf] = ContextVar("names of the running command's option
 
 
 def running_options() -> NameOf:
-    """Return the names of the running command's options; keywords if none runs."""
+    """Return the names of the running command's options; keywords if no command is running."""
     return _running.get()
 
 
 class Command(TyperCommand):
-    """A command whose errors name settings by its own options."""
+    """A command whose errors name settings by the command's options."""
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the command."""
+        """Run the command, and name settings by its options in errors."""
         names = option_names(self)
         token = _running.set(names)
         try:
@@ -67,7 +67,7 @@ class Command(TyperCommand):
 
 
 class Commands(typer.Typer):
-    """A command line, or a group of commands, all of the class `Command`."""
+    """A command line, or a group of commands, whose commands are all of class `Command`."""
 
     def __init__(self, help: str | None = None) -> None:
         super().__init__(
@@ -75,5 +75,5 @@ class Commands(typer.Typer):
         )
 
     def command(self, *given: Any, **options: Any) -> Callable[..., Any]:
-        """Register a command."""
+        """Register a function as a `Command`."""
         return super().command(*given, **options, cls=Command)

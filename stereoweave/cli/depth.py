@@ -1,4 +1,4 @@
-"""The commands stereoweave depth and measure."""
+"""The commands `stereoweave depth` and `stereoweave measure`."""
 
 import json
 from dataclasses import asdict
@@ -34,35 +34,37 @@ Write = Annotated[
     list[str] | None,
     typer.Option(
         metavar="NAME",
-        help="Additional file to write, repeatable: disparity.npy, disparity.tiff; in metres, if the camera "
-        "is known: depth.pfm, depth.npy, depth.tiff, cloud.ply, cloud.glb, mesh.ply, mesh.glb; or all.",
+        help="Additional file to write: disparity.npy or disparity.tiff; in metres, if the camera is known, "
+        "depth.pfm, depth.npy, depth.tiff, cloud.ply, cloud.glb, mesh.ply or mesh.glb; or all. Repeatable.",
     ),
 ]
 PicturesOrFolder = Annotated[
     list[Path] | None,
     typer.Argument(
         metavar="PICTURE",
-        help="LEFT RIGHT, of the same size; or one picture with both views; or a folder of pairs, detected "
-        "by names such as left/1.png, 1_L.jpg, im0.png, 1.mpo.",
+        help="LEFT RIGHT, two pictures of the same size; or one picture that holds both views; or a folder "
+        "of pairs, recognised by names such as left/1.png, 1_L.jpg, im0.png or 1.mpo.",
     ),
 ]
 Left = Annotated[
     str | None,
-    typer.Option(metavar="GLOB", help="Quoted pattern of left pictures, such as 'left/*.png'."),
+    typer.Option(metavar="GLOB", help="Quoted pattern of the left pictures, such as 'left/*.png'."),
 ]
 Right = Annotated[
     str | None, typer.Option(metavar="GLOB", help="Quoted pattern of the right pictures, in the same order.")
 ]
 Listed = Annotated[
     Path | None,
-    typer.Option("--list", help="Text file with a pair per line: left, right, optional name."),
+    typer.Option(
+        "--list", help="Text file with a pair per line: left picture, right picture and, optionally, a name."
+    ),
 ]
 Jobs = Annotated[
     int | None,
     typer.Option(min=1, help="Number of pairs processed in parallel (default: all cores)."),
 ]
-FocalError = Annotated[float, typer.Option(min=0, help="Uncertainty of the focal length, in percent of it.")]
-BaselineError = Annotated[float, typer.Option(min=0, help="Uncertainty of the baseline, in percent of it.")]
+FocalError = Annotated[float, typer.Option(min=0, help="Uncertainty of the focal length, in percent.")]
+BaselineError = Annotated[float, typer.Option(min=0, help="Uncertainty of the baseline, in percent.")]
 
 
 def depth(  # noqa: PLR0913 - each is an option of the command line
@@ -86,7 +88,7 @@ def depth(  # noqa: PLR0913 - each is an option of the command line
     provider: Provider = "cpu",
     as_json: AsJson = False,
 ) -> None:
-    """Estimate depth of one or many stereo pairs: maps, previews and an HTML report."""
+    """Estimate the depth of one or many stereo pairs. Writes maps, previews and an HTML report."""
     from stereoweave.matching.backend import Backend
     from stereoweave.matching.options import MatchOptions
     from stereoweave.outputs.results import DepthJob, make_depth
@@ -111,8 +113,12 @@ def depth(  # noqa: PLR0913 - each is an option of the command line
 
 def measure(  # noqa: PLR0913 - each is an option of the command line
     pictures: Pictures,
-    first: Annotated[str, typer.Option("--from", metavar="X,Y", help="Pixel of the left picture.")],
-    second: Annotated[str, typer.Option("--to", metavar="X,Y", help="Another pixel.")],
+    first: Annotated[
+        str, typer.Option("--from", metavar="X,Y", help="First point: a pixel of the left picture.")
+    ],
+    second: Annotated[
+        str, typer.Option("--to", metavar="X,Y", help="Second point: another pixel of the left picture.")
+    ],
     format: Format = None,
     calib: Calib = None,
     focal_px: FocalPx = None,
@@ -127,9 +133,10 @@ def measure(  # noqa: PLR0913 - each is an option of the command line
     provider: Provider = "cpu",
     as_json: AsJson = False,
 ) -> None:
-    """Measure the distance in metres between two points of the left picture, with its uncertainty.
+    """Measure the distance in metres between two points.
 
-    With --rectify, the points are pixels of the rectified left picture.
+    The points are pixels of the left picture or, with --rectify, of the rectified left picture. The
+    uncertainty of the distance is reported too.
     """
     from stereoweave.matching.backend import Backend
     from stereoweave.matching.estimate import match

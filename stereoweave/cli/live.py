@@ -1,4 +1,4 @@
-"""The command stereoweave live."""
+"""The command `stereoweave live`."""
 
 import os
 import webbrowser
@@ -15,8 +15,8 @@ Sources = Annotated[
     list[str],
     typer.Argument(
         metavar="SOURCE",
-        help="Camera number, video file, stream URL or picture sequence such as frame%03d.png, with both "
-        "views in each frame; or LEFT RIGHT.",
+        help="Camera number, video file, stream URL, or picture sequence such as frame%03d.png, with both "
+        "views in each frame; or two such sources, LEFT RIGHT.",
     ),
 ]
 Format = Annotated[
@@ -24,12 +24,12 @@ Format = Annotated[
     typer.Option(
         "--format",
         help="Frame packing, such as side_by_side or top_bottom_half (default: detected in the first "
-        "frame). An unknown one lists them all.",
+        "frame). An unknown name lists them all.",
     ),
 ]
 Calib = Annotated[
     Path | None,
-    typer.Option(help="Calibration file: rectifies the frames, and gives metres."),
+    typer.Option(help="Calibration file, to rectify the frames and to show metres."),
 ]
 Port = Annotated[
     int, typer.Option(min=0, max=65535, help="Port of the page, on this machine only; 0 takes any free port.")
@@ -48,8 +48,8 @@ def live(  # noqa: PLR0913 - each is an option of the command line
     browser: Browser = True,
     arrangement: OldFormat = None,
 ) -> None:
-    """Show live video of cameras and its depth in colour on a page in the browser; Ctrl-C stops it."""
-    # Otherwise FFmpeg prints its own message beside our error.
+    """Show live video and its depth in colour on a web page. Ctrl-C stops it."""
+    # Otherwise FFmpeg would print its own message besides our error.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     from stereoweave.app.capture import Capture
     from stereoweave.app.live import LiveTally, show
@@ -61,7 +61,7 @@ def live(  # noqa: PLR0913 - each is an option of the command line
     format = replace_old_option(("--arrangement", arrangement), ("--format", format))
     if format not in (None, *PAIR_LAYOUTS) or (format and len(sources) > 1):
         raise StereoweaveError(
-            f"expected {', '.join(PAIR_LAYOUTS)}, of one source with both views, found {format} of "
+            f"expected one of {', '.join(PAIR_LAYOUTS)}, of one source with both views, found {format} of "
             f"{' '.join(sources)}",
             setting="format",
         )

@@ -19,7 +19,10 @@ if TYPE_CHECKING:
 
 Pictures = Annotated[
     list[Path],
-    typer.Argument(metavar="PICTURE", help="LEFT RIGHT, of the same size; or one picture with both views."),
+    typer.Argument(
+        metavar="PICTURE",
+        help="LEFT RIGHT, two pictures of the same size; or one picture that holds both views.",
+    ),
 ]
 Format = Annotated[
     str | None,
@@ -27,27 +30,27 @@ Format = Annotated[
         "--format",
         help="Layout of a picture that holds both views: side_by_side, side_by_side_half, crossed, "
         "crossed_half, top_bottom, top_bottom_half, top_bottom_right_first, top_bottom_right_first_half, "
-        "mpo, jps; default: detected.",
+        "mpo, jps (default: detected).",
     ),
 ]
 OldFormat = Annotated[str | None, typer.Option("--arrangement", hidden=True, help="Old name of --format.")]
 Calib = Annotated[
     Path | None,
     typer.Option(
-        help="Calibration file, for metres and --rectify: OpenCV, Kalibr, KITTI or Middlebury format."
+        help="Calibration file in OpenCV, Kalibr, KITTI or Middlebury format, for metres and rectification."
     ),
 ]
 FocalPx = Annotated[
-    float | None, typer.Option(help="Focal length in pixels, for metres without a calibration file.")
+    float | None, typer.Option(help="Focal length in pixels, in place of a calibration file.")
 ]
 BaselineM = Annotated[
     float | None,
-    typer.Option(help="Distance between the cameras in metres, for metres without a calibration file."),
+    typer.Option(help="Distance between the cameras in metres, in place of a calibration file."),
 ]
 Rectify = Annotated[
     bool,
     typer.Option(
-        "--rectify", help="Rectify the pair: by its calibration, or without one by matched features."
+        "--rectify", help="Rectify the pair by its calibration or, without one, by matched features."
     ),
 ]
 Range = Annotated[
@@ -62,34 +65,33 @@ Refined = Annotated[
     bool,
     typer.Option(
         "--refined",
-        help="Match once more at full resolution, up to 2 megapixels: thin structures, sharper edges.",
+        help="Match once more at full resolution (up to 2 megapixels), for thin structures and sharper "
+        "edges.",
     ),
 ]
 Raw = Annotated[
     bool,
     typer.Option(
         "--raw",
-        help="Write the network's own disparity: occluded pixels not filled, no subpixel refinement.",
+        help="Write the network's own disparity: occluded pixels are not filled, and nothing is refined.",
     ),
 ]
-Strength = Annotated[
-    float, typer.Option(min=0, help="Factor on the baseline; the midpoint of the cameras stays in place.")
-]
+Strength = Annotated[float, typer.Option(min=0, help="Factor that scales the baseline about its midpoint.")]
 Model = Annotated[
     str,
     typer.Option(
-        help="Shipped network (small or base), or an .onnx matcher file; for stills also best: base, run a "
-        "second time at 1.5 times the size, then refined."
+        help="Shipped network (small or base), or an .onnx matcher file. For stills also best, which runs "
+        "base a second time at 1.5 times the size and refines the result."
     ),
 ]
-Threads = Annotated[int | None, typer.Option(min=1, help="CPU threads (default: all cores).")]
+Threads = Annotated[int | None, typer.Option(min=1, help="Number of CPU threads (default: all cores).")]
 Cluster = Annotated[
     str | None,
     typer.Option(
         metavar="ADDRESS",
         help="Run on a Ray cluster: host:port or ray://host:port of its head node, auto for one that runs "
-        "on this machine, local for this machine's cores. All nodes must see the folder under the same "
-        "path. Extra 'cluster'.",
+        "on this machine, or local for this machine's cores. All nodes must see the folder under the same "
+        "path. Needs the extra 'cluster'.",
     ),
 ]
 Provider = Annotated[
@@ -104,27 +106,27 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON."
 Host = Annotated[
     str,
     typer.Option(
-        help="Address to listen on: 127.0.0.1 accepts this computer only, 0.0.0.0 everyone in its networks."
+        help="Address to listen on: 127.0.0.1 accepts only this computer, 0.0.0.0 any that can reach it."
     ),
 ]
 Port = Annotated[int, typer.Option(min=0, max=65535, help="Port to listen on; 0 takes any free port.")]
 
 
 def replace_old_option(old: tuple[str, str | None], new: tuple[str, str | None]) -> str | None:
-    """Return the value of a renamed option, given under its old or its new name; warns about the old name.
+    """Return the value of a renamed option from its old or its new name; warn about the old one.
 
     Args:
         old: The old name and the value given with it, if any.
         new: The same for the new name.
 
     Raises:
-        StereoweaveError: Both are given.
+        StereoweaveError: If both are given.
     """
     (old_name, old_value), (new_name, new_value) = old, new
     if old_value is None:
         return new_value
     if new_value is not None:
-        raise StereoweaveError(f"{old_name}: expected {new_name} alone, its new name, found both")
+        raise StereoweaveError(f"{old_name}: expected only {new_name}, its new name, found both")
     typer.echo(f"stereoweave: warning: {old_name} is deprecated; use {new_name}", err=True)
     return old_value
 
@@ -136,7 +138,7 @@ def make_request(
     baseline_m: float | None = None,
     rectify: bool = False,
 ) -> "Request":
-    """Bundle what a command line states about a pair, apart from its pictures."""
+    """Return the `Request` that the options of a command line make."""
     from stereoweave.pictures.prepare import Request
 
     return Request(
@@ -149,7 +151,7 @@ def make_request(
 
 
 def parse_range_px(text: str | None) -> tuple[float, float] | None:
-    """Parse --range: least and greatest disparity in px; None if not given."""
+    """Parse --range into least and greatest disparity in px; None if it is not given."""
     if text is None:
         return None
     low_px, high_px = _parse_two_numbers("--range", text, "least and greatest disparity, such as -20,150")
@@ -159,7 +161,7 @@ def parse_range_px(text: str | None) -> tuple[float, float] | None:
 
 
 def parse_pixel(option: str, text: str) -> tuple[int, int]:
-    """Parse an option X,Y: column and row of a pixel."""
+    """Parse an option X,Y into the column and row of a pixel."""
     column, row = _parse_two_numbers(option, text, "column and row of a pixel, such as 320,240")
     return round(column), round(row)
 
@@ -182,7 +184,7 @@ def make_engine(cluster: str | None, workers: int | None = None, cpus_each: floa
 
 
 def parse_size_px(size: str) -> tuple[int, int]:
-    """Parse --size: width and height in px."""
+    """Parse --size into width and height in px."""
     found = re.fullmatch("([0-9]{1,9})x([0-9]{1,9})", size)
     if found is None:
         raise StereoweaveError(f"--size: expected width x height in pixels, such as 640x480, found {size!r}")
@@ -190,7 +192,7 @@ def parse_size_px(size: str) -> tuple[int, int]:
 
 
 def make_parent_folder(*files: Path) -> Path:
-    """Call `io.files.make_parent_folder`, imported here only, so that --help stays fast."""
+    """Call `io.files.make_parent_folder`, which is imported here so that --help stays fast."""
     from stereoweave.io import files as io
 
     return io.make_parent_folder(*files)
@@ -216,11 +218,11 @@ def format_url(host: str, port: int) -> str:
 def find_allowed_hosts(listener: socket.socket, host: str) -> tuple[str, ...] | None:
     """Return the names allowed in the header Host; None (any) if other machines can reach the listener.
 
-    This stops DNS rebinding, where another site's DNS server gives its name this machine's address.
+    This prevents DNS rebinding, where a foreign site's name is made to resolve to this machine's address.
 
     Args:
         listener: The listening socket.
-        host: Its address as the user gave it, such as a name in /etc/hosts.
+        host: Address of the listener as the user gave it, such as a name in /etc/hosts.
     """
     address = listener.getsockname()[0]
     if not ip_address(address).is_loopback:
@@ -243,6 +245,6 @@ def require_train_extra(what: str = "this command needs PyTorch and other librar
 def require_synth_extra() -> Iterator[None]:
     """Raise a one-line error that names the `synth` extra if a library is missing."""
     with require_extra("synth", "this command needs the rendering libraries"):
-        import skimage  # noqa: F401 - textures need it later, in worker processes too
+        import skimage  # noqa: F401 - textures need it later, also in worker processes
 
         yield

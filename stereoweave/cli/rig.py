@@ -1,4 +1,4 @@
-"""The commands stereoweave check, rectify and calibrate."""
+"""The commands `stereoweave check`, `rectify` and `calibrate`."""
 
 import json
 import math
@@ -16,9 +16,10 @@ from stereoweave.errors import StereoweaveError
 
 
 def check(pictures: Pictures, format: Format = None, as_json: AsJson = False) -> None:
-    """Check a pair for problems: rectification, swapped pictures, disparity range, exposure.
+    """Check a pair for problems, and report each with its remedy.
 
-    Every problem is reported with its remedy; the exit status is then 1.
+    The checks cover rectification, swapped pictures, disparity range and exposure. The exit status is 1 if
+    there is a problem.
     """
     from stereoweave.cameras.alignment import check_pair
     from stereoweave.pictures.loading import open_pictures
@@ -36,12 +37,12 @@ def check(pictures: Pictures, format: Format = None, as_json: AsJson = False) ->
 
 
 def _name_remedy(setting: str) -> str | None:
-    """Return the option of `check` for a setting; for rectification, which it lacks, the command."""
+    """Return the option of `check` that sets a setting; for rectification, the command that does it."""
     return "stereoweave rectify" if setting == "rectify" else running_options()(setting)
 
 
 def _replace_nan(value: object) -> object:
-    """Replace NaN, unknown, by None, which JSON writes as null."""
+    """Replace NaN, which means unknown, by None, which JSON writes as null."""
     if isinstance(value, tuple):
         return [_replace_nan(part) for part in value]
     return None if isinstance(value, float) and math.isnan(value) else value
@@ -55,9 +56,10 @@ def rectify(
     format: Format = None,
     calib: Calib = None,
 ) -> None:
-    """Rectify a pair, by its calibration, or without one by matched features.
+    """Rectify a pair by its calibration or by matched features.
 
-    The pictures are cropped to their common area. With --calib, calib.yml is the calibration of the results.
+    Features are matched if there is no --calib. The pictures are cropped to their common area. With --calib,
+    calib.yml is the calibration of the results.
     """
     from stereoweave.cameras.calibration_files import write_rig
     from stereoweave.cameras.rectify import crop
@@ -81,7 +83,7 @@ def rectify(
 
 
 def _check_output(pictures: Sequence[Path], calib: Path | None, out: Path) -> None:
-    """Raise a StereoweaveError if results would replace an input, or lie beside an older calib.yml."""
+    """Raise StereoweaveError if a result would replace an input, or lie beside an older calib.yml."""
     given = [file for file in (*pictures, calib) if file and file.exists()]
     for result in (out / "left.png", out / "right.png", out / "calib.yml"):
         if result.exists() and any(result.samefile(file) for file in given):
@@ -90,8 +92,8 @@ def _check_output(pictures: Sequence[Path], calib: Path | None, out: Path) -> No
             )
     if calib is None and (out / "calib.yml").exists():
         raise StereoweaveError(
-            f"{out / 'calib.yml'}: expected no calibration, since these pictures are rectified without one, "
-            "found an older one; choose another --out"
+            f"{out / 'calib.yml'}: expected no file, because pictures rectified without --calib have no "
+            "calibration, found an older one; choose another --out"
         )
 
 
@@ -99,26 +101,33 @@ def calibrate(  # noqa: PLR0913 - each is an option of the command line
     folder: Annotated[
         Path,
         typer.Argument(
-            help="Pictures of a board, at least 5 pairs: in folders left and right, or as left_01, right_01."
+            help="Folder with at least 5 pairs of pictures of a board, in left and right, or as left_01, "
+            "right_01."
         ),
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Calibration file to write, OpenCV YAML.")],
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Calibration file to write, in OpenCV's YAML format.")
+    ],
     board: Annotated[
         str,
         typer.Option(
             metavar="COLUMNSxROWS",
-            help="Inner corners of a chessboard, such as 9x6; squares of a ChArUco board.",
+            help="Inner corners of a chessboard, such as 9x6, or squares of a ChArUco board.",
         ),
     ],
-    square_mm: Annotated[float, typer.Option(help="Side of a square; measure it on the print.")],
+    square_mm: Annotated[
+        float, typer.Option(help="Side of a square in millimetres, measured on the printed board.")
+    ],
     charuco: Annotated[
         str | None,
-        typer.Option(metavar="DICT", help="Marker dictionary of a ChArUco board: DICT_5X5_100."),
+        typer.Option(metavar="DICT", help="Marker dictionary of a ChArUco board, such as DICT_5X5_100."),
     ] = None,
-    marker_mm: Annotated[float | None, typer.Option(help="Side of a ChArUco board's marker.")] = None,
-    fisheye: Annotated[bool, typer.Option("--fisheye", help="The lenses are fisheyes.")] = False,
+    marker_mm: Annotated[
+        float | None, typer.Option(help="Side of a ChArUco board's marker in millimetres.")
+    ] = None,
+    fisheye: Annotated[bool, typer.Option("--fisheye", help="Calibrate fisheye lenses.")] = False,
 ) -> None:
-    """Calibrate two cameras from pictures of a board, and report how accurate the result is."""
+    """Calibrate two cameras from pictures of a board. Reports how accurate the result is."""
     from stereoweave.cameras.boards import Board
     from stereoweave.cameras.calibrate import calibrate as calibrate_by
     from stereoweave.cameras.calibration_files import write_rig

@@ -1,4 +1,4 @@
-"""The command line `stereoweave`: its commands, its exit codes, and the one-line errors."""
+"""The command line `stereoweave`: its commands, exit codes and one-line errors."""
 
 import io
 import sys
@@ -22,7 +22,7 @@ from stereoweave.cli.video import video
 from stereoweave.cli.view import view
 from stereoweave.errors import StereoweaveError
 
-app = Commands()
+app = Commands("Compute depth, and views from between or beyond the cameras, from a stereo pair.")
 app.add_typer(bench, name="bench")
 app.add_typer(synth, name="synth")
 
@@ -33,7 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def run(commands: Commands, program: str, arguments: Sequence[str] | None) -> int:
-    """Run a command line. Returns 0, or 2 after a user's mistake, which is reported on stderr in one line."""
+    """Run a command line. Returns its exit code: 2 after a user's mistake, reported in one line on stderr."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # like stderr, for file names that are not UTF-8
     try:
@@ -60,7 +60,7 @@ def _stereoweave(
         typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit."),
     ] = False,
 ) -> None:
-    """Depth, and any view between the two cameras, from a stereo pair."""
+    """Handle the options of the command `stereoweave` itself."""
 
 
 for command in (depth, measure, view, video, live, check, rectify, calibrate, serve, batch):

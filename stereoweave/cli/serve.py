@@ -1,4 +1,4 @@
-"""The command stereoweave serve."""
+"""The command `stereoweave serve`."""
 
 import math
 import re
@@ -24,7 +24,7 @@ from stereoweave.errors import StereoweaveError, require_extra
 from stereoweave.system.ray_engine import set_environment
 from stereoweave.system.threads import usable_cores
 
-Replicas = Annotated[int, typer.Option(min=1, help="Number of processes; each loads the network.")]
+Replicas = Annotated[int, typer.Option(min=1, help="Number of server processes; each loads the network.")]
 Address = Annotated[
     str | None,
     typer.Option(help="Ray cluster to serve on, as host:port (default: start Ray on this machine)."),
@@ -33,35 +33,45 @@ Batch = Annotated[
     int | None,
     typer.Option(
         min=1,
-        help="Maximum number of pairs matched together (default: 8 on a GPU, 1 on a CPU, which gains nothing "
-        "from more).",
+        help="Maximum number of pairs matched together (default: 8 on a GPU; 1 on a CPU, where larger "
+        "batches are not faster).",
     ),
 ]
 Waiting = Annotated[
     int,
-    typer.Option(min=1, help="Maximum number of pending requests per process; more get 503."),
+    typer.Option(
+        min=1, help="Maximum number of pending requests per process; further ones get HTTP status 503."
+    ),
 ]
 MaxMegabytes = Annotated[
-    float, typer.Option(min=0.001, help="Maximum size of a request; larger ones get 413.")
+    float,
+    typer.Option(min=0.001, help="Maximum size of a request in megabytes; larger ones get HTTP status 413."),
 ]
 MaxMegapixels = Annotated[
     float,
-    typer.Option(min=0.001, max=65, help="Size limit of a view; larger ones get 413, not decoded."),
+    typer.Option(
+        min=0.001,
+        max=65,
+        help="Maximum size of a view in megapixels; larger ones get HTTP status 413 and are not decoded.",
+    ),
 ]
-TimeoutS = Annotated[float, typer.Option(min=0.001, help="Time limit of a request, in seconds; then 504.")]
+TimeoutS = Annotated[
+    float,
+    typer.Option(min=0.001, help="Time limit of a request in seconds; slower ones get HTTP status 504."),
+]
 BehindProxy = Annotated[
     bool,
     typer.Option(
         "--behind-proxy",
-        help="Allow a --host that other machines can reach: a proxy in front of the service "
-        "(deploy/nginx.conf) checks the header Host.",
+        help="Allow a --host that other machines can reach, because a proxy in front of the service "
+        "(deploy/nginx.conf) checks the Host header.",
     ),
 ]
 TokenFile = Annotated[
     Path | None,
     typer.Option(help="File with a bearer token that every request except /health must send."),
 ]
-# The syntax of RFC 6750.
+# Syntax of a bearer token in RFC 6750.
 _TOKEN = r"[A-Za-z0-9\-._~+/]+=*"
 
 
@@ -81,7 +91,7 @@ def serve(  # noqa: PLR0913 - each is an option of the command line
     behind_proxy: BehindProxy = False,
     token_file: TokenFile = None,
 ) -> None:
-    """Serve depth and views over HTTP; Ctrl-C stops the service after the accepted requests."""
+    """Serve depth and views over HTTP. Ctrl-C stops the service once accepted requests are answered."""
     set_environment(address)  # before the service imports Ray
     with require_extra("cluster", "the service needs Ray Serve"):
         from pydantic import SecretStr
@@ -121,7 +131,7 @@ def serve(  # noqa: PLR0913 - each is an option of the command line
 
 
 def _hosts(listener: socket.socket, host: str, behind_proxy: bool) -> tuple[str, ...] | None:
-    """Return the allowed Host headers; None if a proxy checks them."""
+    """Return the values allowed in the Host header; None if a proxy checks it."""
     if behind_proxy:
         return None
     names = find_allowed_hosts(listener, host)
@@ -149,12 +159,12 @@ def _read_token(path: Path) -> str:
 
 
 def _wait_for_signal(message: str) -> None:
-    """Print the message and return at SIGINT or SIGTERM."""
+    """Print the message, and wait for SIGINT or SIGTERM."""
     stopped = threading.Event()
-    # Set here, because Ray installs its own handlers at startup.
+    # The handlers are set here, because Ray installs its own when it starts.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stopped.set())
     typer.echo(message)
-    # Polls: Python handles a signal that another thread received only when this one wakes up.
+    # Polling, because Python handles a signal that another thread receives only once this thread wakes up.
     while not stopped.wait(timeout=1):
         pass

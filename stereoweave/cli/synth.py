@@ -1,4 +1,4 @@
-"""The commands stereoweave synth make | check | sheet | costs."""
+"""The commands `stereoweave synth make | check | sheet | costs`."""
 
 import os
 from pathlib import Path
@@ -9,7 +9,7 @@ import typer
 from stereoweave.cli.commands import Commands
 from stereoweave.cli.options import Cluster, make_engine, parse_size_px, require_synth_extra
 
-synth = Commands("Make, check and view rendered stereo pairs with exact ground truth.")
+synth = Commands("Render and check stereo pairs with exact ground truth.")
 
 # Listed here so that --help imports nothing heavy.
 SCENE_NAMES = (
@@ -25,27 +25,33 @@ Jobs = Annotated[int | None, typer.Option(min=1, help="Number of processes (defa
 def make(  # noqa: PLR0913 - each is an option of the command
     scene: Scene,
     pairs: Annotated[int, typer.Option(min=1, help="Number of pairs in the finished set.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the set.")],
-    seed: Annotated[int, typer.Option(min=0, help="Seed of all random draws.")] = 0,
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Folder of the set, new or to be resumed or extended.")
+    ],
+    seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 0,
     size: Annotated[str, typer.Option(help="Width and height in pixels.")] = "640x480",
     plain: Annotated[
-        bool, typer.Option("--plain", help="Turn off shadows, gloss and the other effects: faster.")
+        bool, typer.Option("--plain", help="Render faster, without shadows, gloss and other effects.")
     ] = False,
     layout: Annotated[
-        str, typer.Option(help="shards (tar files), or paper (folders left, right and depth).")
+        str,
+        typer.Option(help="Layout of the set: shards (tar files), or paper (folders left, right and depth)."),
     ] = "shards",
     frames: Annotated[
-        int, typer.Option(min=1, help="Length of videos by a moving camera, in pairs; 1 makes stills.")
+        int, typer.Option(min=1, help="Number of pairs per video from a moving camera; 1 makes stills.")
     ] = 1,
     view: Annotated[
         list[float] | None,
-        typer.Option(help="Position of an additional view, -1 to 2; 0.5 is halfway. Repeatable."),
+        typer.Option(
+            help="Position of an additional view, -1 to 2; 0.5 is halfway between the cameras. Repeatable."
+        ),
     ] = None,
     rig: Annotated[
         tuple[float, float] | None,
         typer.Option(
             metavar="FOCAL_PX BASELINE_M",
-            help="Focal length and baseline of all pairs (default: drawn for each).",
+            help="Focal length in pixels and baseline in metres of all pairs (default: random for each "
+            "pair).",
         ),
     ] = None,
     jobs: Annotated[
@@ -57,7 +63,7 @@ def make(  # noqa: PLR0913 - each is an option of the command
     ] = None,
     cluster: Cluster = None,
 ) -> None:
-    """Make a set of rendered pairs, or resume or extend one."""
+    """Render a set of pairs, or resume or extend one."""
     with require_synth_extra():
         from stereoweave.synth.sets.make import PairRenderer
         from stereoweave.synth.sets.make import make as make_set
@@ -74,7 +80,10 @@ def make(  # noqa: PLR0913 - each is an option of the command
 def check(
     folder: Annotated[Path, typer.Argument(help="Folder of a set made by synth make.")], jobs: Jobs = None
 ) -> None:
-    """Check a set's checksums and disparities, and print statistics; exit status 1 if a check fails."""
+    """Check a set's checksums and disparities, and print statistics.
+
+    The exit status is 1 if a check fails.
+    """
     from stereoweave.synth.sets.check import check_set, report_lines
 
     found = check_set(folder, _jobs(jobs))
@@ -86,12 +95,15 @@ def check(
 @synth.command()
 def sheet(
     out: Annotated[Path, typer.Option("--out", "-o", help="Picture to write.")],
-    seed: Annotated[int, typer.Option(min=0, help="Seed, see synth make.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Random seed, as for synth make.")] = 0,
     quiz: Annotated[
         bool, typer.Option("--quiz", help="Show 16 unlabelled left pictures, and print their scenes.")
     ] = False,
 ) -> None:
-    """Write a contact sheet with a row per scene: left, right, depth, and occlusion masks."""
+    """Write a contact sheet with a row per scene.
+
+    A row shows the left and the right picture, depth, and both occlusion masks.
+    """
     from stereoweave.io.images import picture_kind, write_image
 
     picture_kind(out)
@@ -113,10 +125,13 @@ def sheet(
 @synth.command()
 def costs(
     scene: Scene = "propeller",
-    pairs: Annotated[int, typer.Option(min=1, help="Number of pairs to average.")] = 3,
+    pairs: Annotated[int, typer.Option(min=1, help="Number of pairs to average over.")] = 3,
 ) -> None:
-    """Measure the time of each rendering effect: milliseconds per 640x480 pair on one core."""
-    # One thread, see synth make; Mesa reads it when the renderer starts.
+    """Measure the time of each rendering effect.
+
+    Times are in milliseconds per 640x480 pair on one core.
+    """
+    # One thread, as in each process of synth make; Mesa reads the variable when the renderer starts.
     os.environ["LP_NUM_THREADS"] = "1"
     with require_synth_extra():
         from stereoweave.synth.sets.effect_costs import measure_effect_costs

@@ -29,10 +29,10 @@ PAIRS_TABLES = {
     },
 }
 
-# Fields of the tables of stereoweave bench pairs --classes, by title; they have a column per class.
+# Fields of the tables of stereoweave bench pairs --classes, by title; each table has a column per class.
 CLASS_TABLES = {
-    "Pixels by class, % of the known ones": "share_percent",
-    "bad-1 by class, points: together they make bad-1": "bad1_percent",
+    "Pixels by class, % of known pixels": "share_percent",
+    "bad-1 by class, points that add up to bad-1": "bad1_percent",
     "bad-2 by class, points": "bad2_percent",
     "EPE within each class, px": "epe_px",
 }
@@ -42,7 +42,7 @@ CLASS_HEADINGS = {"thin_or_edge": "edges", "weak_texture": "weak", "textured": "
 
 # Columns of the tables of stereoweave bench flicker and views.
 FLICKER_TABLES = {
-    "Disparity and the view half-way, mean over the scenes": {
+    "Disparity and the middle view, mean over the scenes": {
         "flicker px": "flicker_px",
         "of the view": "view_flicker_levels",
         "EPE px": "epe_px",
@@ -102,7 +102,7 @@ def print_classes(means: Sequence[Any]) -> None:
     for title, field in CLASS_TABLES.items():
         headings = (Column(CLASS_HEADINGS.get(name, name), justify="right") for name in names)
         table = Table(Column("matcher", no_wrap=True), *headings, title=title)
-        # All matchers have the same share.
+        # The shares are the same for all matchers.
         rows = {"any": matchers[0]} if field == "share_percent" else {Path(m).name: m for m in matchers}
         for label, matcher in rows.items():
             table.add_row(label, *(_cell(getattr(found[matcher, name], field)) for name in names))

@@ -1,4 +1,4 @@
-"""The commands stereoweave train and export."""
+"""The commands `stereoweave train` and `stereoweave export`."""
 
 import re
 from pathlib import Path
@@ -12,7 +12,7 @@ from stereoweave.errors import StereoweaveError
 
 def train(
     recipe: Annotated[Path, typer.Argument(help="Recipe in TOML, such as recipes/weave_small.toml.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the run.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the run, new or to be resumed.")],
 ) -> None:
     """Train the network of a recipe, or resume an interrupted run."""
     from stereoweave.learn.distributed import report_once
@@ -29,7 +29,7 @@ def train(
 def export(  # noqa: PLR0913 - each is an option of the command line
     source: Annotated[
         str,
-        typer.Argument(help="Run folder, checkpoint, shipped model or .onnx matcher file."),
+        typer.Argument(help="Run folder, checkpoint, shipped network or .onnx matcher file."),
     ],
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Output .onnx file in float32.")] = None,
     half: Annotated[Path | None, typer.Option(help="Output .onnx file in 16 bits.")] = None,
@@ -39,28 +39,29 @@ def export(  # noqa: PLR0913 - each is an option of the command line
     weights: Annotated[
         Path | None,
         typer.Option(
-            help="Output .pt file: a run's averaged weights in 16 bits, for start_from of a recipe."
+            help="Output .pt file: a run's averaged weights in 16 bits, for start_from in a recipe."
         ),
     ] = None,
     size: Annotated[
         str | None,
         typer.Option(
             metavar="WxH",
-            help="Make files for single pairs of this size, as TensorRT needs them; default: any size.",
+            help="Make files for single pairs of this size only, as TensorRT requires (default: any size).",
         ),
     ] = None,
     scenes: Annotated[
         Path | None,
         typer.Option(
-            help="Further pairs on which ONNX Runtime and PyTorch must agree: a folder as for bench pairs."
+            help="Folder, as for bench pairs, of further pairs on which ONNX Runtime and PyTorch must agree."
         ),
     ] = None,
     reliability: Annotated[
-        Path | None, typer.Option(help="Output picture: plot of the confidence's reliability.")
+        Path | None, typer.Option(help="Output picture: reliability diagram of the confidence.")
     ] = None,
 ) -> None:
-    """Export a trained network as matcher files for --model, and check that they agree with it.
+    """Export a trained network as matcher files for --model.
 
+    The files are checked to agree with the network on stereo pairs.
     Variants in 16 bits, in 8 bits or for one size are made from a trained network or from a matcher file.
     Each is compared with its source, and rejected if it differs too much.
     """

@@ -1,4 +1,4 @@
-"""The command stereoweave video."""
+"""The command `stereoweave video`."""
 
 from fractions import Fraction
 from pathlib import Path
@@ -28,7 +28,7 @@ Videos = Annotated[
     list[Path],
     typer.Argument(
         metavar="VIDEO",
-        help="Stereo video with both views in each frame; or LEFT RIGHT. Each is a video, a folder of "
+        help="Stereo video with both views in each frame, or LEFT RIGHT. Each is a video file, a folder of "
         "pictures, or a quoted pattern such as 'left/*.png'.",
     ),
 ]
@@ -37,16 +37,20 @@ Out = Annotated[
     typer.Option(
         "--out",
         "-o",
-        help="Video to write: .mp4, .mov or .mkv. Rerun the command to resume an interrupted one.",
+        help="Video to write: .mp4, .mov or .mkv. Rerun the same command to resume after an interruption.",
     ),
 ]
 Depth = Annotated[
     bool,
-    typer.Option("--depth", help="Write the left view's disparity in colour, one range for the whole video."),
+    typer.Option(
+        "--depth", help="Write the left view's disparity in colour, with one range for the whole video."
+    ),
 ]
 Depth16 = Annotated[
     bool,
-    typer.Option("--depth16", help="Write the left view's disparity * 256 as 16-bit grey, lossless, .mkv."),
+    typer.Option(
+        "--depth16", help="Write the left view's disparity * 256 as lossless 16-bit grey, to an .mkv file."
+    ),
 ]
 Position = Annotated[
     float | None,
@@ -69,7 +73,7 @@ Format = Annotated[
     typer.Option(
         "--format",
         help="Frame packing, such as side_by_side, top_bottom_half or crossed (default: detected). An "
-        "unknown one lists them all.",
+        "unknown name lists them all.",
     ),
 ]
 Rate = Annotated[
@@ -97,7 +101,7 @@ def video(  # noqa: PLR0913 - each is an option of the command line
     provider: Provider = "cpu",
     arrangement: OldFormat = None,
 ) -> None:
-    """Convert a stereo video to depth, a new view or a layout; sound and frame times are kept."""
+    """Convert a stereo video to depth, a new view or a layout. Sound and frame times are kept."""
     from rich.console import Console
 
     from stereoweave.io.animation import require_video_extra
@@ -139,9 +143,9 @@ def video(  # noqa: PLR0913 - each is an option of the command line
 
 
 def _parse_rate(rate: str) -> Fraction:
-    """Parse --rate: frames per second, such as 24, 23.976 or 30000/1001."""
+    """Parse --rate into frames per second; accepts numbers such as 24, 23.976 and 30000/1001."""
     try:
-        # FFmpeg's fractions have 32 bits.
+        # Both terms of FFmpeg's fractions have 32 bits.
         fraction = Fraction(rate).limit_denominator(100_000)
     except (ValueError, ZeroDivisionError):
         fraction = Fraction(0)

@@ -1,4 +1,4 @@
-"""The command stereoweave view."""
+"""The command `stereoweave view`."""
 
 import math
 import re
@@ -36,8 +36,8 @@ Out = Annotated[
     typer.Option(
         "--out",
         "-o",
-        help="File to write. Viewers recognise some layouts by a mark in the file name, which is added: "
-        "view.png becomes view_qs8x6a0.75.png for a quilt. .mpo and .jps are 3-D pictures.",
+        help="File to write. Viewers recognise some layouts by a mark in the file name, which is added "
+        "automatically: view.png becomes view_qs8x6a0.75.png for a quilt. .mpo and .jps are 3-D pictures.",
     ),
 ]
 Position = Annotated[
@@ -55,7 +55,7 @@ Layout = Annotated[
     typer.Option(
         help="Layout of several views in one picture: side_by_side, side_by_side_half, crossed, top_bottom, "
         "top_bottom_half, anaglyph_grey, anaglyph_colour, anaglyph_half_colour, anaglyph_dubois, rgbd, "
-        "quilt, contact_sheet; or animation as .mp4 (extra 'video'), .gif or .webp: sweep, wiggle."
+        "quilt, contact_sheet; or an animation, sweep or wiggle, as .mp4 (extra 'video'), .gif or .webp."
     ),
 ]
 Convergence = Annotated[
@@ -67,11 +67,12 @@ Convergence = Annotated[
     ),
 ]
 Quilt = Annotated[
-    str | None, typer.Option(metavar="COLUMNSxROWS", help="Number of views of a quilt (default: 8x6).")
+    str | None,
+    typer.Option(metavar="COLUMNSxROWS", help="Columns and rows of views in a quilt (default: 8x6)."),
 ]
 Calib = Annotated[
     Path | None,
-    typer.Option(help="Calibration file, for --rectify, and for --up and --forward in true proportion."),
+    typer.Option(help="Calibration file, for --rectify, and for correct proportions of --up and --forward."),
 ]
 
 
@@ -93,7 +94,10 @@ def view(  # noqa: PLR0913 - each is an option of the command line
     threads: Threads = None,
     provider: Provider = "cpu",
 ) -> None:
-    """Render a new view of a stereo pair, or several in a layout for 3-D viewers and displays."""
+    """Render a new view of a stereo pair, or a layout of several.
+
+    Layouts are for 3-D viewers and displays.
+    """
     from stereoweave.cameras.diagnosis import find_problems
     from stereoweave.cameras.rectify import crop
     from stereoweave.matching.backend import Backend
@@ -112,7 +116,9 @@ def view(  # noqa: PLR0913 - each is an option of the command line
     name = choose_layout(out, layout)
     _check_unused(name, {"--position": position, "--up": up or None, "--forward": forward or None}, quilt)
     if name == "rgbd" and (strength != 1 or convergence is not None):
-        raise StereoweaveError("--strength, --convergence: expected with several views, found with rgbd")
+        raise StereoweaveError(
+            "--strength, --convergence: expected with a layout of several views, found with rgbd"
+        )
     check_position(_MIDDLE, up=up, forward=forward)
     layout_options = _parse_quilt(quilt)
     positions, converged = _view_positions(name, _MIDDLE if position is None else position)
@@ -142,11 +148,13 @@ def _check_unused(name: str | None, single_view: dict[str, float | None], quilt:
     given = [option for option, value in single_view.items() if value is not None]
     if name is not None and given:
         raise StereoweaveError(
-            f"{given[0]}: expected for a single view, found with the layout {name}, whose positions are "
+            f"{given[0]}: expected only for a single view, found with the layout {name}, whose positions are "
             "fixed; widen them with --strength"
         )
     if name != "quilt" and quilt is not None:
-        raise StereoweaveError(f"--quilt: expected with --layout quilt, found with {name or 'a single view'}")
+        raise StereoweaveError(
+            f"--quilt: expected only with --layout quilt, found with {name or 'a single view'}"
+        )
 
 
 def _parse_quilt(quilt: str | None) -> "LayoutOptions":
@@ -171,7 +179,7 @@ def _view_positions(name: str | None, position: float) -> tuple[tuple[float, ...
 
 
 def _parse_convergence_px(convergence: str) -> float | None:
-    """Parse --convergence: a disparity in px; None for auto, which needs the estimate."""
+    """Parse --convergence into a disparity in px; None for auto, which needs the estimate."""
     if convergence == "auto":
         return None
     try:

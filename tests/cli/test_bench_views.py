@@ -69,7 +69,10 @@ def test_models_can_be_chosen(sets, tmp_path):
             ("left", "right"),
             "expected an image from between the cameras, such as view_0.5.png, found no view_*.png",
         ),
-        (("left", "right", "view_half"), "a position of -1 to 2 (0 left camera, 1 right), found 'half'"),
+        (
+            ("left", "right", "view_half"),
+            "a position of -1 to 2 (0 is the left camera, 1 the right one), found 'half'",
+        ),
     ],
 )
 def test_a_folder_that_cannot_be_scored_is_told_in_one_line(tmp_path, capfd, pictures, fragment):

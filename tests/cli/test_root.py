@@ -445,7 +445,7 @@ def test_bench_networks_takes_a_checkpoint_and_pairs_from_where_it_is_told(netwo
     [
         ("bench networks folder -o rows.csv", ["folder/last.pt", "no such checkpoint"]),
         ("bench networks nowhere -o rows.csv", ["nowhere: no such checkpoint"]),
-        ("bench networks here here -o rows.csv", ["here", "different names"]),
+        ("bench networks here here -o rows.csv", ["here", "unique name"]),
         ("bench networks folder -o taken.png", ["taken.png", "expected a file", "found a folder"]),
         ("bench networks", ["RUN..."]),
     ],
