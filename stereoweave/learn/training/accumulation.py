@@ -14,8 +14,8 @@ class StepSums:
     """Losses, gradients and batch-norm statistics, summed over the micro-batches of one step.
 
     PyTorch's DistributedDataParallel adds gradients in float32. Such sums depend on the order of addition,
-    hence on the number of processes: losses differ by 1 % after 50 steps of a small network. Here they are
-    added in float64; rounding back to float32 hides the order, except for one value in millions.
+    hence on the number of processes: losses differ by 1 % after 50 steps of a small network. Here, gradients
+    are added in float64. Rounding back to float32 hides the order, except in one value in millions.
     """
 
     def __init__(self, network: nn.Module) -> None:
@@ -29,7 +29,7 @@ class StepSums:
     def add(self, losses: Sequence[Float[Tensor, ""]]) -> None:
         """Add a micro-batch after its backward pass, and reset the statistics to those before the step."""
         values = [*losses, *self._gradients(), *self.statistics]
-        # Apple's GPUs have no float64, but never run in groups either.
+        # Apple's GPUs have no float64, but they never train in several ranks either.
         exact = torch.float32 if losses[0].device.type == "mps" else torch.float64
         row = torch.cat([value.detach().flatten().to(exact) for value in values])
         # In place, as below: for a large network the sums take as much memory as the optimiser.
@@ -39,7 +39,7 @@ class StepSums:
             value.copy_(before)
 
     def finish(self, fabric: Fabric, micro_batches: int) -> list[float]:
-        """Set gradients and statistics to their means over all ranks' micro-batches. Returns mean losses."""
+        """Set gradients and statistics to their means over all micro-batches. Returns the mean losses."""
         total = fabric.all_reduce(self.total, reduce_op="sum")
         assert isinstance(total, Tensor)
         into = [*self._gradients(), *self.statistics]
@@ -48,7 +48,7 @@ class StepSums:
         for value, mean in zip(into, means, strict=True):
             value.copy_(mean.view_as(value))
         for layer in self.norms:
-            # A step counts as one batch.
+            # Batch norms count a step as one batch.
             if layer.num_batches_tracked is not None:
                 layer.num_batches_tracked -= self.count - 1
         return losses.tolist()

@@ -13,7 +13,7 @@ class RunClock:
     """Elapsed and remaining time of a run. Arguments `now_s` are values of `time.monotonic`.
 
     Attributes:
-        began_s: When this command began.
+        began_s: Start of this command.
         used_s: Seconds used by earlier commands.
         minutes: Time limit of this command.
         total_minutes: Time limit of all commands together.
@@ -25,25 +25,25 @@ class RunClock:
     total_minutes: float
 
     def elapsed_s(self, now_s: float) -> float:
-        """Seconds of the run used so far."""
+        """Return the seconds of the run used so far."""
         return self.used_s + now_s - self.began_s
 
     def elapsed_share(self, now_s: float) -> float:
-        """Share of the run's time used so far, 0 to 1; at 1 the last command stops training."""
+        """Return the share of the run's time used so far, 0 to 1; at 1, the last command stops training."""
         return min(self.elapsed_s(now_s) / (60 * self.total_minutes - RESERVE_S), 1.0)
 
     def remaining_s(self, now_s: float) -> float:
-        """Seconds left to train in this command; negative when overdue."""
+        """Return the seconds left to train in this command; negative when overdue."""
         of_run = 60 * self.total_minutes - self.elapsed_s(now_s)
         of_command = 60 * self.minutes - (now_s - self.began_s)
         return min(of_run, of_command) - RESERVE_S
 
 
 def learning_rate_at(recipe: Recipe, optimiser_steps: int, share: float) -> float:
-    """The learning rate: linear warm-up over the recipe's steps, constant, then linear decay to 0 at the end.
+    """Return the learning rate: linear warm-up over steps, a constant phase, then linear decay to 0.
 
     Args:
-        recipe: The decay takes the share `cool_down_steps / steps` of the time.
+        recipe: Its decay takes the share `cool_down_steps / steps` of the time.
         optimiser_steps: Steps since the optimiser started without a state.
         share: Share of the run's time used so far.
     """
@@ -53,5 +53,5 @@ def learning_rate_at(recipe: Recipe, optimiser_steps: int, share: float) -> floa
 
 
 def is_cooling_down(recipe: Recipe, share: float) -> bool:
-    """Whether the learning rate decays at this share of the time."""
+    """Return whether the learning rate decays at this share of the time."""
     return (1 - share) * recipe.steps < recipe.cool_down_steps

@@ -21,34 +21,34 @@ _KEYS = ("recipe", "step", "pairs")
 
 
 class PowerLaw(NamedTuple):
-    """A power law: score = at_10000_pairs * (pairs / 10,000) ** -exponent."""
+    """The power law score = at_10000_pairs * (pairs / 10,000) ** -exponent."""
 
     at_10000_pairs: float
     exponent: float
 
 
 def fit_power_law(pairs: Sequence[float], scores: Sequence[float]) -> PowerLaw:
-    """Fit a power law to positive scores by least squares on logarithms."""
+    """Fit a power law to positive scores by least squares on their logarithms."""
     slope, offset = np.polyfit(np.log(np.divide(pairs, 10_000)), np.log(scores), 1)
     return PowerLaw(at_10000_pairs=float(np.exp(offset)), exponent=float(-slope))
 
 
 def record_curve(run: Path, out: Path) -> dict[str, PowerLaw]:
-    """Write a run's scores to a CSV file. Returns the power law of each bad-1 and end-point error.
+    """Write a run's scores to a CSV file. Returns a power law for each bad-1 and end-point error.
 
     Rows of other recipes in the file are kept and come first.
 
     Args:
         run: Folder of the run.
-        out: The CSV file: recipe, step, pairs seen, scores, commit and machine.
+        out: CSV file of recipe, step, pairs seen, scores, commit and machine.
 
     Raises:
-        StereoweaveError: The run has no scores yet.
+        StereoweaveError: If the run has no scores yet.
     """
     kept, record = checkpoint.load(run / "last.pt"), read_scores(run / SCORES_FILE)
     if not record:
         raise StereoweaveError(
-            f"{run / SCORES_FILE}: expected scores of a run, found none; let it validate first"
+            f"{run / SCORES_FILE}: expected scores of a run, found none; train until its first validation"
         )
     recipe = kept.recipe
     machine = f"{platform.machine()} {torch.backends.cpu.get_cpu_capability()}"

@@ -21,7 +21,7 @@ from torch.distributed.rendezvous import rendezvous
 from stereoweave.errors import StereoweaveError
 from stereoweave.learn.distributed import ProcessRank, choose_thread_count, read_rank
 
-# The other ranks wait for rank 0 while it makes pairs or scores. If rank 0 dies, torchrun ends them.
+# The other ranks wait while rank 0 makes pairs or validates. If rank 0 dies, torchrun ends them.
 _TIMEOUT = timedelta(days=1)
 
 
@@ -33,7 +33,7 @@ def make_fabric(logger: TensorBoardLogger) -> Fabric:
     cuda = torch.cuda.is_available()
     if cuda and own.local_world_size > torch.cuda.device_count():
         raise StereoweaveError(
-            f"torchrun: expected at most one process for each of {torch.cuda.device_count()} GPUs, found "
+            f"torchrun: expected at most one process for each of the {torch.cuda.device_count()} GPUs, found "
             f"{own.local_world_size}; start fewer with --nproc-per-node"
         )
     if (threads := choose_thread_count()) and not cuda:
@@ -68,7 +68,7 @@ def skip_teardown_on_error() -> Iterator[None]:
 
 
 def keep_freed_memory() -> None:
-    """Make glibc keep large freed blocks: new ones from the kernel slow down every step."""
+    """Make glibc keep large freed blocks, because fetching new ones from the kernel slows down every step."""
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
     if mallopt is not None:
         m_trim_threshold, m_top_pad, m_mmap_max = -1, -2, -4
@@ -95,7 +95,7 @@ def _join_ranks(own: ProcessRank, backend: str) -> None:
 
 
 def _choose_precision() -> Literal["bf16-mixed", "32-true"]:
-    """bfloat16 if the device has native support, else float32."""
+    """Return bfloat16 mixed precision if the device supports it natively, else float32."""
     if torch.accelerator.is_available():
         computes = torch.cuda.is_bf16_supported()
     else:

@@ -27,17 +27,17 @@ from stereoweave.learn.training.run import TrainingRun, load_start
 from stereoweave.learn.training.scores import validate_by_class
 from stereoweave.system.progress import progress
 
-# In the run's folder, beside the checkpoint: the scores of every validation.
+# Scores of every validation, in the run's folder.
 SCORES_FILE = "validation.csv"
 
 
 def train(recipe_path: Path, out: Path, console: Console | None = None) -> Path:
-    """Train the network of a recipe in folder `out`, or resume there. Returns the last checkpoint's path.
+    """Train the network of a recipe in folder `out`, or resume its run. Returns the last checkpoint's path.
 
     Under torchrun the ranks share each step's micro-batches; only rank 0 writes.
 
     Raises:
-        StereoweaveError: The recipe is invalid, `out` is in use or holds the run of another recipe, or the
+        StereoweaveError: If the recipe is invalid, `out` is in use or holds the run of another recipe, or the
             loss is not finite.
     """
     with report_once(), skip_teardown_on_error():
@@ -85,7 +85,7 @@ def _train(recipe: Recipe, out: Path, console: Console) -> Path:
 def _prepare_pairs(
     recipe: Recipe, out: Path, console: Console, fabric: Fabric
 ) -> tuple[PairSource, PairSource]:
-    """Open the training and held-out pairs. Rank 0 makes missing ones."""
+    """Open the training pairs and the held-out pairs. Rank 0 makes missing ones."""
     found = open_sources(recipe, out.parent / "pairs")
     if fabric.is_global_zero:
         for pairs in found:
@@ -98,19 +98,19 @@ def _prepare_pairs(
 
 def _folder_not_shared(out: Path) -> StereoweaveError:
     return StereoweaveError(
-        f"{out}: expected the run that rank 0 sees there, found another on {platform.node()}; "
+        f"{out}: expected the run that rank 0 sees in this folder, found another on {platform.node()}; "
         "train into a folder that all machines share"
     )
 
 
 def _validate(run: TrainingRun, steps: int, held_out: PairSource, last: Path, console: Console) -> None:
-    """Score the run after `steps` steps; save checkpoint and scores."""
+    """Score the run after `steps` steps, and save its checkpoint and scores."""
     network, device = run.averaged.module, run.fabric.device
     scores = run.objective.scores(network, held_out, device)
     for name, pairs in run.by_class.items():
         found = validate_by_class(network, pairs, device)
         scores |= {f"{name}_{key}": value for key, value in found.items()}
-    # Before the checkpoint: a run killed in between writes the same row again.
+    # Scores are saved before the checkpoint: a run killed in between writes the same row again.
     append_scores(last.with_name(SCORES_FILE), steps, scores)
     run.save(steps, scores, last)
     console.print(f"step {steps}: " + "  ".join(f"{k} {v:.4g}" for k, v in scores.items()))
@@ -135,7 +135,7 @@ def read_scores(path: Path) -> list[dict[str, float]]:
 
 @contextmanager
 def close_curves(logger: TensorBoardLogger) -> Iterator[TensorBoardLogger]:
-    """Yield the logger, and flush it when the block ends, also after an error."""
+    """Yield the logger, and flush it when the block ends, even after an error."""
     try:
         yield logger
     finally:
@@ -156,13 +156,13 @@ def _check_recipe(recipe: Recipe) -> None:
         )
     if recipe.micro_batches % read_rank().world_size:
         raise FormatError(
-            f"{recipe.name}: {recipe.micro_batches} micro-batches a step, expected a multiple of the "
+            f"{recipe.name}: {recipe.micro_batches} micro-batches per step, expected a multiple of the "
             f"{read_rank().world_size} processes; set micro_batch, or --nproc-per-node"
         )
 
 
 def _load_batches(batches: Batches, first: int) -> Iterator[tuple[int, dict[str, torch.Tensor]]]:
-    """Yield (step, batch) from step `first` to the last; another process crops and recolours."""
+    """Yield the number and the batch of each step from `first` on; another process crops and recolours."""
     steps = range(first, batches.recipe.steps)
     loader = DataLoader(
         CaughtBatches(batches),
@@ -171,7 +171,7 @@ def _load_batches(batches: Batches, first: int) -> Iterator[tuple[int, dict[str,
         num_workers=1,
         prefetch_factor=4,
         multiprocessing_context="spawn",
-        # Its own generator: a loader draws a seed when it starts, and a restart would draw again.
+        # With its own generator, because a loader draws a seed at each start, hence again when a run resumes.
         generator=torch.Generator(),
     )
     for step, batch in zip(steps, loader, strict=True):

@@ -1,4 +1,4 @@
-"""Loss functions: maps [B, 1, H, W] to a scalar. NaN in the ground truth is ignored.
+"""Loss functions, from maps [B, 1, H, W] to a scalar. NaN in the ground truth is ignored.
 
 `weave_losses` and its terms are for WeaveNet. `CODE_LOSSES` and `projection_loss` are those of "Fast Depth
 Estimation for View Synthesis", for networks that predict the code of a `DepthCurve`. The perceptual loss
@@ -26,7 +26,7 @@ def weave_losses(
     distribution: float = 1.0,
     compare: Callable[[Tensor, Tensor], Tensor] | None = None,
 ) -> dict[str, Tensor]:
-    """Terms of WeaveNet's loss by name, already weighted; training minimises their sum.
+    """Return the weighted terms of WeaveNet's loss by name; training minimises their sum.
 
     Ground truth beyond the last level counts as unknown. Ground truth below 0 px, which the network cannot
     predict, counts only in the confidence loss.
@@ -41,7 +41,7 @@ def weave_losses(
     compare = compare or regression_loss
     columns = torch.arange(truth_px.shape[3], device=truth_px.device)
     unmatched = occluded | (truth_px > columns)
-    # Pixels per level: the factor by which the score maps are smaller.
+    # Pixels per level, which is also the factor by which the score maps are smaller.
     step = truth_px.shape[3] // stages.scores.shape[3]
     centres = (..., slice(step // 2 - 1, None, step), slice(step // 2 - 1, None, step))
     reach_px = step * (stages.scores.shape[1] - 1)
@@ -61,7 +61,7 @@ def weave_losses(
 def level_cross_entropy(
     scores: Float[Tensor, "b d h w"], truth: Float[Tensor, "b 1 h w"]
 ) -> Float[Tensor, ""]:
-    """Cross-entropy over levels. The target is split linearly between the two levels next to the truth."""
+    """Return the cross-entropy over levels; the target is split linearly between the two nearest ones."""
     levels = scores.shape[1]
     known = (truth >= 0) & (truth <= levels - 1)
     truth = truth.where(known, 0)
@@ -74,12 +74,13 @@ def level_cross_entropy(
 def regression_loss(
     estimate_px: Float[Tensor, "b 1 h w"], truth_px: Float[Tensor, "b 1 h w"], robust: float = 0.0
 ) -> Float[Tensor, ""]:
-    """Mean absolute error, quadratic below 0.5 px; the share `robust` of it becomes 2.5 log(1 + error).
+    """Return the mean absolute error, quadratic below 0.5 px, mixed with a logarithm by the share `robust`.
 
-    The logarithm has its largest gradient on errors that are close to counting as correct.
+    The logarithmic part is 2.5 log(1 + error). Its gradient is largest for small errors, which are close to
+    counting as correct.
     """
     known = truth_px.isfinite()
-    # Unknown truth is replaced first: NaN times a mask is NaN, in the gradient too.
+    # Unknown truth is replaced first, because NaN times a mask is NaN, in the gradient too.
     loss = F.huber_loss(estimate_px, truth_px.where(known, 0), reduction="none", delta=0.5) / 0.5
     if robust:
         loss = (1 - robust) * loss + robust * _ROBUST_SCALE * loss.log1p()
@@ -91,45 +92,45 @@ def confidence_loss(
     disparity_px: Float[Tensor, "b 1 h w"],
     truth_px: Float[Tensor, "b 1 h w"],
 ) -> Float[Tensor, ""]:
-    """Binary cross-entropy of the predicted probability that the disparity is within 1 px."""
+    """Return the binary cross-entropy of the predicted probability that the disparity is within 1 px."""
     within = (disparity_px.detach() - truth_px).abs() <= 1
     loss = F.binary_cross_entropy_with_logits(logit, within.float(), reduction="none")
     return masked_mean(loss, truth_px.isfinite())
 
 
 def halve(truth_px: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b 1 h2 w2"]:
-    """Mean of each 2x2 block, in pixels of the full resolution; NaN where the block spans an edge."""
+    """Return the mean of each 2x2 block, in pixels of full resolution; NaN where a block spans an edge."""
     blocks = F.pixel_unshuffle(truth_px, 2)
     low, high = blocks.aminmax(dim=1, keepdim=True)
     return blocks.mean(1, keepdim=True).where(high - low < 1, torch.nan)
 
 
 def l2_loss(code: Float[Tensor, "b 1 h w"], truth: Float[Tensor, "b 1 h w"]) -> Float[Tensor, ""]:
-    """Mean squared error of the code: the first term of the paper's equation (5)."""
+    """Return the mean squared error of the code: the first term of the paper's equation (5)."""
     return _mean_known_loss(F.mse_loss, code, truth)
 
 
 def l1_loss(code: Float[Tensor, "b 1 h w"], truth: Float[Tensor, "b 1 h w"]) -> Float[Tensor, ""]:
-    """Mean absolute error of the code."""
+    """Return the mean absolute error of the code."""
     return _mean_known_loss(F.l1_loss, code, truth)
 
 
 def smooth_l1_loss(
     code: Float[Tensor, "b 1 h w"], truth: Float[Tensor, "b 1 h w"], beta: float = 1 / 192
 ) -> Float[Tensor, ""]:
-    """Smooth L1 loss of the code: quadratic below beta, absolute error less beta / 2 above.
+    """Return the smooth L1 loss of the code: quadratic below beta, absolute error less beta / 2 above.
 
-    PSMNet and others switch at 1 px. For a code with exponent 1 that is 1 / max_disparity_px; the default
-    1 / 192 is for PSMNet's range.
+    PSMNet and others switch at 1 px. For a code with exponent 1, this is 1 / max_disparity_px. The default
+    of 1 / 192 is for PSMNet's range.
     """
     return _mean_known_loss(partial(F.smooth_l1_loss, beta=beta), code, truth)
 
 
 def cross_entropy_loss(code: Float[Tensor, "b 1 h w"], truth: Float[Tensor, "b 1 h w"]) -> Float[Tensor, ""]:
-    """Mean binary cross-entropy of codes in 0..1; minimal, but not 0, where the code equals the truth.
+    """Return the mean binary cross-entropy of codes in 0..1, which is least, but not 0, at the true code.
 
-    PyTorch clamps it to 100 and its gradient to 1e12, so both are finite where a code is exactly 0 or 1.
-    Behind a sigmoid, whose slope is 0 there, such a code learns nothing.
+    PyTorch clamps the loss to 100 and its gradient to 1e12, so both are finite where a code is exactly 0 or
+    1. A sigmoid with such an output has a slope of 0, so it learns nothing there.
     """
     return _mean_known_loss(F.binary_cross_entropy, code, truth)
 
@@ -145,22 +146,24 @@ CODE_LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
 def projection_loss(
     left: Float[Tensor, "b c h w"], right: Float[Tensor, "b c h w"], disparity_px: Float[Tensor, "b 1 h w"]
 ) -> Float[Tensor, ""]:
-    """Mean squared difference of the left image and its reconstruction: second term of equation (5).
+    """Return the mean squared difference of the left image and its reconstruction from the right image.
+
+    This is the second term of the paper's equation (5).
 
     The mean is over all pixels of the batch whose match lies inside the right image; 0 if there are none.
-    The paper does not define the images' range and channels. Here images are in 0..1, like the code, so that
-    equal weights are comparable; channels are averaged, so that grey and colour weigh the same.
+    The paper does not define the images' range and channels. Here, images are in 0..1, like the code, so that
+    the weights of both terms are comparable. Channels are averaged, so that grey and colour weigh the same.
     """
     reconstructed, exists = reconstruct_left(right, disparity_px)
     return masked_mean(((reconstructed - left) ** 2).mean(1, keepdim=True), exists)
 
 
 def masked_mean(values: Float[Tensor, "..."], known: Bool[Tensor, "..."]) -> Float[Tensor, ""]:
-    """Mean of the known values; 0, with a gradient of 0, if there are none."""
+    """Return the mean of the known values; 0, with a gradient of 0, if there are none."""
     return values.where(known, 0).sum() / known.sum().clamp(min=1)
 
 
 def _mean_known_loss(loss: Callable[..., Tensor], code: Tensor, truth: Tensor) -> Tensor:
     known = truth.isfinite()
-    # Unknown truth is replaced first: NaN times a mask is NaN, in the gradient too.
+    # Unknown truth is replaced first, because NaN times a mask is NaN, in the gradient too.
     return masked_mean(loss(code, truth.where(known, 0), reduction="none"), known)

@@ -22,7 +22,7 @@ class ModelState:
     Args:
         start: Weights and recipe to start from.
         device: Device of the network and of its average.
-        update_average: Moves the average towards the current weights, as `AveragedModel` calls it.
+        update_average: Moves the average towards the current weights; called by `AveragedModel`.
         optimiser_state: State of the optimiser; {} for a new one.
     """
 
@@ -52,5 +52,5 @@ class ModelState:
             self.optimiser.load_state_dict(optimiser_state)
 
     def clip_gradient(self) -> Tensor:
-        """Scale the gradient down to a norm of at most 5. Returns the norm before."""
+        """Scale the gradient down to a norm of at most 5. Returns the norm before scaling."""
         return nn.utils.clip_grad_norm_(self.network.parameters(), _MAX_GRADIENT_NORM)

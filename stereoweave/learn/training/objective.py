@@ -36,7 +36,7 @@ Map = Float[Tensor, "b 1 h w"]
 
 WEAVE, SMOOTH_L1, CROSS_ENTROPY, PERCEPTUAL = "weave", "smooth_l1", "cross_entropy", "perceptual"
 LOSSES = (WEAVE, *CODE_LOSSES, PERCEPTUAL)
-# Training pairs and bins of the ground-truth histogram that an exponent is fitted to.
+# Numbers of training pairs and of bins in the ground-truth histogram to which an exponent is fitted.
 _FITTED_PAIRS, _FITTED_BINS = 200, 256
 
 
@@ -45,15 +45,15 @@ class Objective(Protocol):
     """A training loss and the validation scores that go with it."""
 
     def predict(self, network: Any, batch: Batch) -> Any:
-        """Predict whatever `losses` needs, in the training's precision."""
+        """Return the predictions that `losses` needs, in the precision of the training."""
         ...
 
     def losses(self, predicted: Any, batch: Batch) -> dict[str, Tensor]:
-        """Loss terms by name, already weighted; training minimises their sum."""
+        """Return the weighted loss terms by name; training minimises their sum."""
         ...
 
     def scores(self, network: Any, pairs: PairSource, device: torch.device) -> dict[str, float]:
-        """Mean scores over held-out pairs."""
+        """Return mean scores over held-out pairs."""
         ...
 
 
@@ -71,16 +71,16 @@ def build_objective(recipe: Recipe, network: nn.Module) -> Objective:
     if recipe.loss == CROSS_ENTROPY and network.predicts != "code":
         raise FormatError(
             f"{recipe.name}: loss = {recipe.loss!r}, expected a network that predicts codes, found "
-            f"model = {recipe.model!r}, whose pixels may leave their range; take another loss"
+            f"model = {recipe.model!r}, whose disparities may leave their range; choose another loss"
         )
     return CodeObjective(recipe, network)
 
 
 class WeaveObjective:
-    """Disparity of both views, with supervision of every stage of WeaveNet.
+    """Objective for WeaveNet: disparity of both views, with supervision of every stage.
 
-    With an exponent above 1 the regression compares codes of a `DepthCurve` times max_disparity_px; with
-    exponent 1 these are pixels.
+    With an exponent above 1, the regression compares codes of a `DepthCurve` times max_disparity_px. With
+    an exponent of 1, it compares disparities in pixels.
     """
 
     def __init__(self, recipe: Recipe) -> None:
@@ -112,7 +112,7 @@ class WeaveObjective:
 
 
 class CodeObjective:
-    """The paper's equation (5) between codes of a `DepthCurve`, for the left view.
+    """Objective of the paper's equation (5), between codes of a `DepthCurve`, for the left view.
 
     Disparities in pixels are converted to the same code, so that every network trains on every target and
     with every loss. With loss = "smooth_l1" (or "l1"), exponent = 1 and alpha_p = 0 this is PSMNet's (or
@@ -138,7 +138,7 @@ class CodeObjective:
         return output if self.predicts == "code" else self.curve.encode_estimate(self.quantity(output, batch))
 
     def quantity(self, output: Map, batch: Batch) -> Map:
-        """Convert a network's output to the target: disparity in px, or depth in m."""
+        """Convert a network's output to the quantity of the target: disparity in px, or depth in m."""
         if self.predicts == "code":
             return self.curve.decode(output)
         return output if self.recipe.target == "disparity" else self._depth_m(output, batch)
@@ -156,10 +156,10 @@ class CodeObjective:
 
     @torch.no_grad()
     def scores(self, network: CodeNetwork, pairs: PairSource, device: torch.device) -> dict[str, float]:
-        """Mean `loss` and its terms, `epe_px`, and `depth_error_m` if the target is depth.
+        """Return the mean loss, its terms and errors over held-out pairs.
 
-        `squared_error` is that of the linear code, before the exponent. Unlike the loss it can be compared
-        between exponents.
+        `squared_error` is the error of the linear code, before the exponent. Unlike the loss, it can be
+        compared between exponents. `depth_error_m` is returned only if the target is depth.
         """
         network.eval()
         rows = []
@@ -177,9 +177,10 @@ class CodeObjective:
         return terms
 
     def _depth_m(self, disparity_px: Map, batch: Batch) -> Map:
-        """Depth of an estimated disparity, extended linearly along the tangent beyond max_depth_m.
+        """Return the depth of an estimated disparity, extended along the tangent beyond max_depth_m.
 
-        So it is finite, with a gradient, for disparities of 0 or less, where an untrained network may start.
+        The extension is finite and has a gradient even for disparities of 0 or less, where an untrained
+        network may start.
         """
         focal_baseline, shifted_px = batch["focal_baseline_px_m"], disparity_px + batch["doffs_px"]
         least_px = focal_baseline / self.recipe.max_depth_m
@@ -204,7 +205,7 @@ class CodeObjective:
 
 
 def _choose_comparison(recipe: Recipe) -> Callable[[Map, Map], Tensor]:
-    """The loss between a predicted and a true code."""
+    """Return the loss function between a predicted and a true code."""
     if recipe.loss == PERCEPTUAL:
         if not recipe.vgg16_weights:
             raise FormatError(
@@ -213,7 +214,7 @@ def _choose_comparison(recipe: Recipe) -> Callable[[Map, Map], Tensor]:
             )
         return PerceptualLoss(Path(recipe.vgg16_weights))
     if recipe.loss == SMOOTH_L1:
-        # For linear codes of disparity the switch is at 1 px, as published.
+        # For linear codes of disparity, the loss switches at 1 px, as published.
         return partial(smooth_l1_loss, beta=1 / recipe.max_disparity_px)
     return CODE_LOSSES[recipe.loss]
 
@@ -226,14 +227,14 @@ def build_curve(recipe: Recipe) -> DepthCurve:
 
 
 def fit_recipe(recipe: Recipe, pairs: PairSource) -> Recipe:
-    """Fit the recipe's exponent to the training pairs' ground truth if `fit_exponent` is set."""
+    """Return the recipe, with its exponent fitted to the training pairs if `fit_exponent` is set."""
     if not recipe.fit_exponent:
         return recipe
     return replace(recipe, exponent=fit_exponent(count_truth(recipe, pairs)))
 
 
 def count_truth(recipe: Recipe, pairs: PairSource) -> Float[np.ndarray, " n"]:
-    """Histogram of the normalised ground truth over evenly spread pairs: linear codes, equal bins."""
+    """Return a histogram of linear codes of the ground truth, in equal bins, over evenly spread pairs."""
     straight = build_curve(replace(recipe, exponent=1.0))
     counts = np.zeros(_FITTED_BINS)
     for index in range(0, pairs.count, max(1, pairs.count // _FITTED_PAIRS)):
@@ -244,10 +245,10 @@ def count_truth(recipe: Recipe, pairs: PairSource) -> Float[np.ndarray, " n"]:
 
 
 def compute_target(recipe: Recipe, batch: Batch) -> Map:
-    """The left views' ground truth as the recipe's target: disparity in px or depth in m; NaN where unknown.
+    """Return the left views' truth as the recipe's target: disparity in px or depth in m; NaN where unknown.
 
-    Disparity above max_disparity_px counts as unknown, as in PSMNet's code; depth beyond max_depth_m does
-    not.
+    Disparity above max_disparity_px counts as unknown, as in PSMNet's code. Depth beyond max_depth_m does
+    not, and is later rejected as an error.
     """
     disparity_px = batch["disparity_px"][: len(batch["left"])]
     if recipe.target == "disparity":
@@ -258,13 +259,13 @@ def compute_target(recipe: Recipe, batch: Batch) -> Map:
             f"{recipe.dataset!r} without one; train on disparity"
         )
     depth_m = batch["focal_baseline_px_m"] / (disparity_px + batch["doffs_px"])
-    # A depth of exactly max_depth_m, stored as disparity, may come back a rounding error larger.
+    # A depth of exactly max_depth_m, stored as disparity, may come back larger by a rounding error.
     return depth_m.where(depth_m > 1.0001 * recipe.max_depth_m, depth_m.clamp(max=recipe.max_depth_m))
 
 
 @contextmanager
 def name_in_errors(what: str) -> Iterator[None]:
-    """Prefix a StereoweaveError of the block with the pair or pairs in question, unless already named."""
+    """Prefix a StereoweaveError of the block with `what`, the pairs in question, unless it starts with it."""
     try:
         yield
     except StereoweaveError as error:

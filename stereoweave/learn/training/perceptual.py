@@ -1,4 +1,4 @@
-"""Perceptual loss: compares maps by the features of a network trained on photographs."""
+"""Perceptual loss, which compares maps by the features of a network trained on photographs."""
 
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ class PerceptualLoss(nn.Module):
     frozen; the file needs only those of the first four convolutions.
 
     Args:
-        weights: File of VGG-16's weights under torchvision's names; never downloaded automatically.
+        weights: File with VGG-16's weights under torchvision's names; never downloaded automatically.
     """
 
     mean: Tensor
@@ -28,7 +28,7 @@ class PerceptualLoss(nn.Module):
 
     def __init__(self, weights: Path) -> None:
         super().__init__()
-        # Without storage, so that no random weights are drawn: a seed gives the same training with any loss.
+        # Without storage, so that no random weights are drawn: a seed trains the same with any loss.
         with torch.device("meta"):
             self.features = nn.Sequential(
                 *_convolution(3, 64), *_convolution(64, 64), nn.MaxPool2d(2),
@@ -36,16 +36,16 @@ class PerceptualLoss(nn.Module):
             )  # fmt: skip
         self.load_state_dict(_read(weights, self.state_dict()), assign=True)
         self.requires_grad_(False)
-        # ImageNet's statistics, with which VGG-16 was trained; not part of the state, which mirrors the file.
+        # ImageNet's statistics, with which VGG-16 was trained; not in the state, which mirrors the file.
         mean, deviation = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
         self.register_buffer("mean", mean.view(3, 1, 1), persistent=False)
         self.register_buffer("deviation", deviation.view(3, 1, 1), persistent=False)
 
     def forward(self, code: Float[Tensor, "b 1 h w"], truth: Float[Tensor, "b 1 h w"]) -> Float[Tensor, ""]:
-        """Mean squared difference of the features; 0 if no pixel is known.
+        """Return the mean squared difference of the features; 0 if no pixel is known.
 
         A feature covers 14x14 pixels, so unknown pixels cannot be masked afterwards. They are set to the
-        prediction on both sides, where they are equal and have no gradient. The mean is divided by the
+        prediction in both maps, so that they are equal and have no gradient. The mean is divided by the
         share of known pixels, so that sparse ground truth weighs as much as in the other losses.
 
         Args:
@@ -59,7 +59,7 @@ class PerceptualLoss(nn.Module):
         return difference * known.numel() / known.sum().clamp(min=1)
 
     def _extract_features(self, code: Tensor) -> Tensor:
-        # Broadcasts the one channel to three.
+        # The subtraction broadcasts the one channel to three.
         return self.features((code - self.mean) / self.deviation)
 
 
@@ -68,7 +68,7 @@ def _convolution(inputs: int, outputs: int) -> tuple[nn.Module, nn.Module]:
 
 
 def _read(path: Path, expected: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Read the tensors named in `expected`, in float32. Raises FormatError if one is missing or misshapen."""
+    """Read the tensors named in `expected`, in float32. Raises FormatError if one does not fit."""
     found = _load(path)
     for name, tensor in expected.items():
         shape = list(getattr(found.get(name), "shape", [])) or "nothing"

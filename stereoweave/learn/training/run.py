@@ -22,7 +22,7 @@ from stereoweave.learn.training.accumulation import StepSums
 from stereoweave.learn.training.model_state import STEPS_BETWEEN_SKIPS, ModelState
 from stereoweave.learn.training.objective import name_in_errors
 
-# Longest time between two checkpoints: a killed run loses no more.
+# Longest time between two checkpoints, which is the most that a killed run loses.
 _SAVE_EVERY_S = 600
 # Recipe keys that may change when a run resumes.
 _RESUMABLE = ("steps", "cool_down_steps", "mix", "pair_size", "crop_size", "validate_every", "held_out")
@@ -51,7 +51,7 @@ class TrainingRun(ModelState):
         A step whose loss or gradient is not finite changes nothing; it is counted and logged.
 
         Raises:
-            StereoweaveError: Two such steps are less than 500 steps apart.
+            StereoweaveError: If two such steps are less than 500 steps apart.
         """
         for group in self.optimiser.param_groups:
             group["lr"] = self.recipe.learning_rate_at(step)
@@ -76,11 +76,11 @@ class TrainingRun(ModelState):
     def _gradient(
         self, step: int, batch: dict[str, torch.Tensor], batches: Batches, sums: StepSums
     ) -> dict[str, float]:
-        """Set the gradient of a step, summed over all ranks. Returns the loss and its terms."""
+        """Compute the gradient of a step over all ranks. Returns the loss and its terms."""
         what = f"step {step}: one of {', '.join(batches.names(step))}"
         for part, values in zip(batches.parts, split_batch(batch, len(batches.parts)), strict=True):
             if self.recipe.micro_batches > 1:
-                # Dropout depends on the micro-batch, not on the rank.
+                # Seeded per micro-batch, so that dropout does not depend on the number of ranks.
                 torch.manual_seed(int(np.random.SeedSequence(batches.key(step, part)).generate_state(1)[0]))
             with self.fabric.autocast():
                 predicted = self.objective.predict(self.network, values)
@@ -102,7 +102,7 @@ class TrainingRun(ModelState):
         _LOGGER.warning("%s; skipped", found)
 
     def save_periodically(self, step: int, path: Path) -> None:
-        """Save a checkpoint after `step` steps if the last one is ten minutes old."""
+        """Save a checkpoint after `step` steps if the last one is over ten minutes old."""
         if self.fabric.is_global_zero and time.monotonic() - self.saved_s > _SAVE_EVERY_S:
             self._write(step, self.scores, path)
 
@@ -146,7 +146,7 @@ def _update_average(
     current: Sequence[torch.Tensor],
     steps: torch.Tensor | int,
 ) -> None:
-    """Move the average towards the current weights: fast at first, so that random ones are soon forgotten."""
+    """Move the average towards the current weights, fast at first to forget the initial weights soon."""
     share = max(1 / averaged_steps, 9 / (9 + float(steps)))
     for average, value in zip(averaged, current, strict=True):
         if average.is_floating_point():

@@ -17,7 +17,7 @@ Map = Float[np.ndarray, "h w"]
 
 @torch.no_grad()
 def validate(network: nn.Module, pairs: PairSource, device: torch.device) -> dict[str, float]:
-    """Mean scores over the left views of the pairs, occluded pixels included."""
+    """Return mean scores over the left views of the pairs, occluded pixels included."""
     rows, confidences, truths = [], [], []
     for sample, estimate_px, confidence in _predict(network, pairs, device):
         rows.append(_compute_errors(estimate_px, sample.disparity_px))
@@ -30,7 +30,7 @@ def validate(network: nn.Module, pairs: PairSource, device: torch.device) -> dic
 
 @torch.no_grad()
 def validate_by_class(network: nn.Module, pairs: PairSource, device: torch.device) -> dict[str, float]:
-    """Mean scores over the left views, and each pixel class's contribution to bad-1.
+    """Return mean scores over the left views, and the contribution of each class of pixels to bad-1.
 
     Ground truth beyond the network's range is ignored.
     """
@@ -48,7 +48,7 @@ def validate_by_class(network: nn.Module, pairs: PairSource, device: torch.devic
 def _predict(
     network: nn.Module, pairs: PairSource, device: torch.device
 ) -> Iterator[tuple[Sample, Map, Map]]:
-    """Each sample with its left disparity in px and its confidence."""
+    """Yield each sample with the network's left disparity in px and its confidence."""
     network.eval()
     for index in range(pairs.count):
         sample = pairs[index]

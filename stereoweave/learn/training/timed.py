@@ -1,7 +1,7 @@
-"""Training for a fixed time, for a machine available in short sessions with time-limited commands.
+"""Training for a fixed time, on a machine that is available only for short commands.
 
-`train` counts steps. Here a command ends on time, the learning rate reaches 0 when the minutes of all
-commands are used up, and each command resumes from the files of the previous one.
+While `train` counts steps, here a command ends on time. The learning rate reaches 0 when the minutes of all
+commands are used up. Each command resumes from the files of the previous one.
 """
 
 import math
@@ -30,7 +30,7 @@ Report = Callable[[str], None]
 
 _REPORT_EVERY_S, _SAVE_EVERY_S = 15.0, 60.0
 _TRIED_STEPS = 3
-# Largest relative error of a loss computed in bfloat16, which has 8 bits of precision.
+# Largest accepted relative error of a loss computed in bfloat16, which has 8 bits of precision.
 _BFLOAT16_SHARE = 0.05
 
 
@@ -40,7 +40,7 @@ class TimedCommand:
 
     Attributes:
         out: Folder to write to, and to resume from if it holds a run.
-        earlier: Folder with an earlier command's files; the run that is further ahead is resumed.
+        earlier: Folder with an earlier command's files; of it and `out`, the run further ahead is resumed.
         began_s: Start of the command, by `time.monotonic`.
         minutes: Time limit of this command.
         total_minutes: Time limit of all commands together.
@@ -63,7 +63,7 @@ class TimedCommand:
 
 @dataclass(frozen=True)
 class _Snapshot:
-    """A moment of the training, and the counters at it."""
+    """Time and counters at one moment of the training."""
 
     at_s: float
     pairs: int = 0
@@ -72,10 +72,10 @@ class _Snapshot:
 
 
 def train_by_clock(recipe: Recipe, command: TimedCommand, report: Report) -> RunProgress:
-    """Train for a command's minutes. Returns the run's progress.
+    """Train for the minutes of one command. Returns the run's progress.
 
     Raises:
-        StereoweaveError: The files to resume from are invalid, no batches can be made, or losses are not
+        StereoweaveError: If the files to resume from are invalid, no batches can be made, or losses are not
             finite.
     """
     make_folder(command.out)
@@ -108,7 +108,7 @@ def train_by_clock(recipe: Recipe, command: TimedCommand, report: Report) -> Run
 
 
 class _TimedLoop:
-    """The loop of one command."""
+    """The training loop of one command."""
 
     def __init__(self, run: TimedRun, painters: Painters, clock: RunClock, out: Path, report: Report) -> None:
         self.run, self.painters, self.clock, self.out, self.report = run, painters, clock, out, report
@@ -126,7 +126,7 @@ class _TimedLoop:
             if is_cooling_down(self.recipe, share):
                 self.painters.switch(len(self.painters.recipes) - 1)
             pairs, loss = len(batch["left"]), self.run.begin(batch)
-            # Here, while the GPU is still computing the gradient.
+            # The next batch is taken while the GPU is still computing the gradient.
             batch = self.run.move_to_device(self.painters.take())
             self._count(pairs, self.run.finish(loss, rate))
             if time.monotonic() - self.reported.at_s > _REPORT_EVERY_S:
@@ -153,9 +153,9 @@ class _TimedLoop:
         return None
 
     def _smoke_test(self) -> dict[str, torch.Tensor]:
-        """Run every part once on the first batch, so that no later command finds a fault. Returns the batch.
+        """Run every part once on the first batch, so that faults show at once. Returns the batch.
 
-        Disables bfloat16 if its loss differs from that in float32.
+        Disables bfloat16 if its loss differs too much from the loss in float32.
         """
         batch = self.run.move_to_device(self.painters.take())
         plain = self.run.loss(batch, bfloat16=False)
@@ -175,14 +175,14 @@ class _TimedLoop:
         return batch
 
     def _measure_step_s(self, batch: dict[str, torch.Tensor]) -> float:
-        """Mean time of a few steps at a learning rate of 0, after one warm-up step."""
+        """Return the mean time of a few steps at a learning rate of 0, after one warm-up step."""
         for step in range(1 + _TRIED_STEPS):
             if step == 1:
                 began_s = time.monotonic()
             if math.isnan(self.run.finish(self.run.begin(batch), 0.0)):
                 raise StereoweaveError(
                     "the first batch: expected a finite loss and gradient, found NaN or infinity; "
-                    "use other weights"
+                    "start from other weights"
                 )
         return (time.monotonic() - began_s) / _TRIED_STEPS
 

@@ -17,8 +17,8 @@ from stereoweave.learn.checkpoint import Checkpoint, Weights
 from stereoweave.learn.recipe import Recipe
 from stereoweave.learn.training.model_state import ModelState
 
-# A checkpoint without the optimiser's state, which `stereoweave train` and `export` accept; that state; and
-# the progress.
+# A checkpoint that `stereoweave train` and `export` accept, the optimiser's state, which it lacks, and the
+# progress.
 NETWORK_FILE, OPTIMISER_FILE, PROGRESS_FILE = "network.pt", "optimiser.pt", "progress.json"
 
 
@@ -55,11 +55,11 @@ class ResumePoint:
 
 
 def find_resume_point(recipe: Recipe, out: Path, earlier: Path | None, commit: str) -> ResumePoint:
-    """Find the run in `out` or `earlier`, whichever is further ahead; else start a new run.
+    """Return the state of the run in `out` or `earlier`, whichever is further ahead, else of a new run.
 
     Raises:
-        FormatError: A file is broken or missing, or `start_from` shares no weights with the network.
-        StereoweaveError: The run trains another network.
+        FormatError: If a file is broken or missing, or `start_from` shares no weights with the network.
+        StereoweaveError: If the run trains another network.
     """
     if earlier and not (earlier / PROGRESS_FILE).exists():
         raise FormatError(
@@ -105,7 +105,7 @@ class TimedRun(ModelState):
         super().__init__(start, device, update_average, optimiser)
         self.device = device
         self.bfloat16 = device.type == "cuda" and torch.cuda.is_bf16_supported()
-        # At 0 the first update would copy the weights. On the CPU it is read without waiting for the GPU.
+        # At 0, the first update would copy the weights. On the CPU, reading it does not wait for the GPU.
         self.averaged.n_averaged = torch.ones((), dtype=torch.long)
 
     def move_to_device(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -115,14 +115,14 @@ class TimedRun(ModelState):
 
     @torch.no_grad()
     def loss(self, batch: dict[str, Tensor], bfloat16: bool) -> float:
-        """Loss of a batch in the given precision, without learning."""
+        """Return the loss of a batch in the given precision, without learning."""
         self.network.train()
         value = float(self._loss(batch, bfloat16))
         self._restore_statistics()
         return value
 
     def begin(self, batch: dict[str, Tensor]) -> Tensor:
-        """Compute a step's gradient. Returns its loss; on a GPU both are computed asynchronously."""
+        """Compute a step's gradient. Returns the step's loss; on a GPU, both are computed asynchronously."""
         self.network.train()
         self.optimiser.zero_grad()
         loss = self._loss(batch, self.bfloat16)
@@ -144,20 +144,20 @@ class TimedRun(ModelState):
 
     @torch.no_grad()
     def scores(self, held_out: Any) -> dict[str, float]:
-        """Scores of the averaged network on held-out pairs."""
+        """Return the scores of the averaged network on held-out pairs."""
         return self.objective.scores(self.averaged.module, held_out, self.device)
 
     def save(self, folder: Path, progress: RunProgress, hours: float, scores: dict[str, float]) -> None:
         """Write network, optimiser and progress, each atomically.
 
         Raises:
-            StereoweaveError: A weight is not finite; the previous files are kept.
+            StereoweaveError: If a weight is not finite; the previous files are kept.
         """
         weights, averaged = _copy_to_cpu(self.network), _copy_to_cpu(self.averaged.module)
         if not all(bool(value.isfinite().all()) for value in (*weights.values(), *averaged.values())):
             raise StereoweaveError(
                 f"step {progress.steps}: expected finite weights, found NaN or infinity; {folder} keeps "
-                "the last checkpoint: lower the learning rate"
+                "the last checkpoint; lower the learning rate and resume"
             )
         state = replace(
             self.start, step=progress.steps, weights=weights, averaged=averaged, hours=hours, scores=scores
@@ -175,7 +175,7 @@ class TimedRun(ModelState):
 
     @torch.no_grad()
     def _restore_statistics(self) -> None:
-        """Set the batch norms' statistics to the average's: their own may no longer be finite."""
+        """Set the batch norms' statistics to those of the averaged network, which are always finite."""
         for value, kept in zip(self.network.buffers(), self.averaged.module.buffers(), strict=True):
             value.copy_(kept)
 

@@ -22,7 +22,7 @@ def reconstruct_left(
     columns = torch.arange(last + 1, device=right.device, dtype=torch.float32)
     position_px = columns - disparity_px
     exists = (position_px >= 0) & (position_px <= last)
-    # Replaced first, so that no index leaves the row and no infinity is multiplied by a gradient of 0.
+    # Outside positions are replaced first, so no index leaves the row, and no infinity meets a gradient of 0.
     position_px = position_px.where(exists, 0)
     start = position_px.detach().floor().clamp(max=last - 1)
     first, second = (right.gather(3, (start.long() + i).expand_as(right)) for i in (0, 1))
@@ -35,10 +35,10 @@ def depth_to_disparity(
     doffs_px: Float[Tensor, "b 1 1 1"],
     width_px: int,
 ) -> Float[Tensor, "b 1 h w"]:
-    """Disparity f B / z - doffs in pixels, with finite value and gradient for any depth, including 0.
+    """Return the disparity f B / z - doffs in px, with finite value and gradient for any depth, 0 included.
 
-    Depth below f B / (width + |doffs|) has its match outside the right image; there the disparity is
-    clamped to that of the limit, without a gradient.
+    Depth below f B / (width + |doffs|) has its match outside the right image. Its disparity is clamped to the
+    disparity of this limit, without a gradient.
 
     Args:
         depth_m: Depth of the left view.

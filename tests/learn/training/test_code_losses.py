@@ -17,7 +17,7 @@ NAN = math.nan
 
 
 def a_map(*values):
-    """One row of one map [1, 1, 1, W], that learns."""
+    """Return a map [1, 1, 1, W] of one row, with a gradient."""
     return torch.tensor(values, dtype=torch.float64).view(1, 1, 1, -1).requires_grad_()
 
 
@@ -36,7 +36,7 @@ def test_smooth_l1_is_the_absolute_error_less_half_of_beta_and_a_parabola_below_
     assert found.item() == pytest.approx((0.4 - 0.05 + 0.05**2 / (2 * 0.1)) / 2)
 
 
-def test_smooth_l1_turns_at_one_pixel_of_192_unless_told_otherwise():
+def test_smooth_l1_switches_at_one_pixel_of_192_by_default():
     # PSMNet's loss in pixels, 192 times this one: 0.5 px costs 0.125, 2 px cost 1.5.
     found = 192 * smooth_l1_loss(a_map(0.5 / 192, 2 / 192), a_map(0.0, 0.0))
     assert found.item() == pytest.approx((0.125 + 1.5) / 2)
@@ -62,7 +62,7 @@ def test_cross_entropy_is_finite_at_codes_of_exactly_zero_and_one():
 
 
 @pytest.mark.parametrize("output", [-200.0, 200.0])
-def test_a_sigmoid_that_has_run_into_its_end_gets_finite_gradients_from_cross_entropy(output):
+def test_a_saturated_sigmoid_gets_finite_gradients_from_cross_entropy(output):
     logit = torch.full((1, 1, 1, 2), output, requires_grad=True)
     cross_entropy_loss(logit.sigmoid(), torch.tensor([0.0, 1.0]).view(1, 1, 1, 2)).backward()
     assert logit.grad.isfinite().all()
@@ -75,7 +75,7 @@ def test_the_gradients_of_the_code_losses_are_those_of_their_values(loss):
 
 
 @pytest.mark.parametrize("loss", CODE_LOSSES.values())
-def test_unknown_truth_costs_nothing_and_pulls_nowhere(loss):
+def test_unknown_truth_has_no_loss_and_no_gradient(loss):
     code = a_map(0.2, 0.4, 0.0, 1.0)
     loss(code, a_map(0.3, NAN, NAN, math.inf)).backward()
     assert code.grad.flatten()[0] != 0
@@ -83,7 +83,7 @@ def test_unknown_truth_costs_nothing_and_pulls_nowhere(loss):
 
 
 @pytest.mark.parametrize("loss", CODE_LOSSES.values())
-def test_truth_that_is_all_unknown_gives_zero_and_pulls_nowhere(loss):
+def test_truth_that_is_all_unknown_gives_zero_loss_and_gradient(loss):
     code = a_map(0.2, 0.0, 1.0)
     found = loss(code, a_map(NAN, NAN, NAN))
     found.backward()
@@ -91,7 +91,7 @@ def test_truth_that_is_all_unknown_gives_zero_and_pulls_nowhere(loss):
     assert not code.grad.any()
 
 
-def test_projection_is_the_squared_difference_of_the_left_image_and_what_the_right_shows_of_it():
+def test_projection_is_the_squared_difference_of_the_left_image_and_its_reconstruction():
     # Read at -1 (outside), 0.5, 1, 1.75: 0.3, 0.4, 0.7 against 0.5, 0.4, 0.6.
     found = projection_loss(a_map(9.0, 0.5, 0.4, 0.6), a_map(0.2, 0.4, 0.8, 0.9), a_map(1.0, 0.5, 1.0, 1.25))
     assert found.item() == pytest.approx((0.04 + 0 + 0.01) / 3)
@@ -105,7 +105,7 @@ def test_projection_weighs_grey_and_colour_alike():
 
 def test_projection_is_zero_at_the_disparity_that_made_the_pair():
     right = torch.rand(2, 3, 4, 12, generator=torch.Generator().manual_seed(0))
-    left = right.roll(3, dims=3)  # columns 0 to 2 come round from the other side and are not asked for
+    left = right.roll(3, dims=3)  # columns 0 to 2 wrap around from the other side and are not used
     assert projection_loss(left, right, torch.full((2, 1, 4, 12), 3.0)).item() == 0
 
 

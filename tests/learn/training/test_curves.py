@@ -11,7 +11,7 @@ from stereoweave.learn.training.loop import SCORES_FILE, append_scores
 
 @pytest.fixture
 def run(tmp_path):
-    """A run of batches of 2 that was scored five times; its bad-1 falls as the fourth root of the pairs."""
+    """Write a run with batches of 2 and five scores, whose bad-1 falls as the fourth root of the pairs."""
     run = tmp_path / "weave_tiny"
     run.mkdir()
     checkpoint.save(checkpoint_of(untrained()), run / "last.pt")

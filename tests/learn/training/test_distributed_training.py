@@ -1,4 +1,4 @@
-"""Training by torchrun's processes, which is to end as training by one process does."""
+"""Training by the processes of torchrun, whose results must equal those of one process."""
 
 import os
 import shutil
@@ -36,7 +36,7 @@ def folder(tmp_path_factory):
 
 
 def torchrun(folder, recipe, *options):
-    """Two processes that train a recipe, and the file of what they say."""
+    """Start two processes that train a recipe. Returns torchrun and the file of their output."""
     log, file = folder / f"{recipe.name}.log", write(recipe, folder / f"{recipe.name}.toml")
     command = [Path(sys.executable).with_name("torchrun"), "--nproc-per-node", "2", *options]
     with log.open("w") as stream:
@@ -44,28 +44,28 @@ def torchrun(folder, recipe, *options):
             [*command, "-m", "stereoweave", "train", file, "-o", folder / recipe.name],
             stdout=stream,
             stderr=stream,
-            # As here: with other threads sums are others.
+            # As in this process, because sums depend on the number of threads.
             env={**os.environ, "OMP_NUM_THREADS": "1"},
         )
     return process, log
 
 
 def kill(torchrun, rank):
-    """End one of its processes without a word."""
+    """Kill one of the processes."""
     children = Path(f"/proc/{torchrun.pid}/task/{torchrun.pid}/children").read_text().split()
     (pid,) = (pid for pid in children if f"\0RANK={rank}\0" in Path(f"/proc/{pid}/environ").read_text())
     os.kill(int(pid), signal.SIGKILL)
 
 
 def train_here(recipe, out, patch):
-    """Train in this one process, which also cuts the pairs."""
+    """Train in this process, which also crops the pairs."""
     steps = lambda batches, first: ((i, batches[i]) for i in range(first, batches.recipe.steps))  # noqa: E731
     patch.setattr(training, "_load_batches", steps)
     return checkpoint.load(training.train_recipe(recipe, out, QUIET))
 
 
 def losses(run):
-    """By step, where they are kept."""
+    """Return the logged losses by step."""
     events = EventAccumulator(str(run)).Reload()
     return {event.step: event.value for event in events.Scalars("loss")}
 
@@ -84,21 +84,21 @@ def test_two_processes_of_which_one_is_killed_end_as_one_process_does(folder, mo
 
     shared, killed = checkpoint.load(last), checkpoint.load(folder / "changed" / "last.pt")
     assert (killed.step, shared.step) == (16, 30)
-    # One that goes on alone where two stood.
+    # Resumed by one process where two had stopped.
     changed = train_here(recipe, folder / "changed", monkeypatch)
     for name in ("weights", "averaged", "scores"):
         assert_same(getattr(shared, name), getattr(alone, name))
         assert_same(getattr(changed, name), getattr(alone, name))
     assert losses(folder / "shared") == losses(folder / "alone")
     assert losses(folder / "alone").keys() == {0, 20}
-    # Of the two starts, the first process's alone; scores are told once.
+    # Only rank 0 of the two starts writes; scores are printed once.
     assert len(list((folder / "shared").glob("events.out.*"))) == 2
     assert log.read_text().count("step 30: epe_px") == 1
     assert "RuntimeError" not in log.read_text()
 
 
-def test_an_error_of_the_first_process_alone_ends_all_with_its_one_line(folder):
-    """While the others wait for it, who are not to speak of lost connections."""
+def test_an_error_of_rank_0_alone_ends_all_with_its_one_line(folder):
+    """The other ranks, which wait for it, must not report lost connections."""
     (folder / "taken").touch()
     process, log = torchrun(folder, replace(PARTED, name="taken"))
     assert process.wait() == 1
@@ -114,7 +114,7 @@ def test_a_step_that_cannot_be_shared_out_is_refused_before_anything_is_made(tmp
         monkeypatch.setenv(name, value)
     message = complaint(training.train_recipe, PARTED, tmp_path / "run", QUIET)
     assert message == (
-        "tiny: 4 micro-batches a step, expected a multiple of the 3 processes; "
+        "tiny: 4 micro-batches per step, expected a multiple of the 3 processes; "
         "set micro_batch, or --nproc-per-node"
     )
     assert not list(tmp_path.iterdir())

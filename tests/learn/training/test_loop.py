@@ -56,7 +56,7 @@ CAMERA_PAIRS = Listed(
 
 
 def in_memory(recipe):
-    """The recipe for `CAMERA_PAIRS`, so small that PSMNet is quick; Table I has five such."""
+    """Return the recipe for `CAMERA_PAIRS`, small enough for PSMNet to be fast."""
     return replace(
         recipe,
         name=recipe.model,
@@ -68,7 +68,7 @@ def in_memory(recipe):
         crop_size=(64, 64),
         batch=2,
         micro_batch=0,
-        # A long warm-up moves some weights by less than float32 can tell.
+        # A long warm-up moves some weights by less than the precision of float32.
         warm_up_steps=min(recipe.warm_up_steps, 2),
         held_out=(),
         max_disparity_px=48.0,
@@ -80,7 +80,7 @@ FIRST_STEPS = {in_memory(read_recipe(file)): file.stem for file in RECIPES}
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Where runs go, with the pairs that they train on and are scored on."""
+    """Return the folder of the runs, with their training and held-out pairs."""
     folder = tmp_path_factory.mktemp("runs")
     keep_pairs(folder / "pairs", RECIPE.seed, RECIPE.pairs)
     keep_pairs(folder / "pairs", VALIDATION_SEED, RECIPE.validation_pairs)
@@ -94,7 +94,7 @@ def recipe_file(folder):
 
 @pytest.fixture(scope="module")
 def finished(folder, recipe_file):
-    """The last checkpoint of a run that nothing stopped."""
+    """Return the last checkpoint of a run that was not interrupted."""
     with pytest.MonkeyPatch.context() as patch:
         make_batches_in_place(patch)
         return train(recipe_file, folder / "finished", QUIET)
@@ -229,7 +229,7 @@ def test_a_process_that_fails_does_not_wait_for_the_others_to_leave_their_gpus(t
 
 
 def test_a_pair_that_cannot_be_trained_on_is_named_in_one_line(tmp_path):
-    """Although it is read in a process beside, where PyTorch would put a traceback before the words."""
+    """It is read in another process, where PyTorch would put a traceback before the message."""
     for frame in ("a", "b"):
         for side in ("left", "right"):
             write_picture(tmp_path / "set" / side / f"{frame}.png", 7)
@@ -272,11 +272,11 @@ def test_a_gradient_that_is_not_finite_never_reaches_the_weights_and_twice_stops
     run.step(7, batches[7], batches)
     assert run.skipped == [7]
     assert caplog.messages[-1] == f"{found}; skipped"
-    run.step(507, batches[507], batches)  # 500 steps later it is isolated still
+    run.step(507, batches[507], batches)  # 500 steps later it is still isolated
     assert complaint(run.step, 1006, batches[1006], batches).endswith(
         "; step 507 was skipped for the same reason"
     )
-    # Batch norms' statistics included.
+    # This includes the statistics of batch norms.
     assert_same(network.state_dict(), before)
     assert_same(run.averaged.module.state_dict(), before)
     assert not run.optimiser.state_dict()["state"]
@@ -303,7 +303,7 @@ def test_a_run_into_a_file_fails_before_any_pair_is_made(recipe_file, tmp_path):
 
 
 def step_of(recipe, folder, logger, steps=1):
-    """The first steps of a recipe on pairs in memory: the run after them, and every parameter before."""
+    """Take the first steps of a recipe on pairs in memory. Returns the run, and its initial parameters."""
     run = TrainingRun(recipe, load_start(recipe, folder / "last.pt"), make_fabric(logger))
     before = {name: value.clone() for name, value in run.network.named_parameters()}
     batches = Batches(recipe, CAMERA_PAIRS)
@@ -320,23 +320,23 @@ def assert_all_moved(run, before):
 
 @pytest.mark.parametrize("recipe", FIRST_STEPS, ids=FIRST_STEPS.values())
 def test_every_shipped_recipe_takes_its_first_steps(recipe, tmp_path, logger):
-    # WeaveNet's first two only wake what adds nothing until it is trained, one behind the other.
+    # WeaveNet has layers that start at zero, so its first two steps only enable them one after the other.
     steps = 3 if recipe.model.startswith("weave") else 1
     assert_all_moved(*step_of(recipe, tmp_path, logger, steps))
 
 
 @pytest.mark.parametrize("model", [name for name in MODELS if not name.startswith("weave")])
 def test_any_of_the_papers_networks_trains_by_changing_one_word(model, tmp_path, logger):
-    """All of equation (5) on depth with an exponent, in the one batch that all of them see."""
+    """The loss is all of equation (5) on depth with an exponent, on one batch for all networks."""
     recipe = recipe_of("fast_depth", target="depth", exponent=1.5, alpha_p=1.0, averaged_steps=1)
     run, before = step_of(replace(recipe, model=model), tmp_path, logger)
     assert_all_moved(run, before)
-    # An average over one step is that step's weights.
+    # An average over one step equals the weights of that step.
     assert_same(dict(run.averaged.module.state_dict()), dict(run.network.state_dict()))
 
 
 def test_a_code_network_that_is_resumed_ends_as_one_that_was_not(folder, in_place):
-    """Dropout included, whose draws go on where they were."""
+    """This includes dropout, whose random draws continue."""
     recipe = recipe_of("fast_depth", name="paper", steps=4, alpha_p=1.0)
     whole = checkpoint.load(training.train_recipe(recipe, folder / "paper", QUIET))
     last = folder / "paper_resumed" / "last.pt"

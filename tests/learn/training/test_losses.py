@@ -18,12 +18,12 @@ LEVELS = 4
 
 
 def a_map(*values):
-    """One row of one map [1, 1, 1, W], that learns."""
+    """Return a map [1, 1, 1, W] of one row, with a gradient."""
     return torch.tensor(values, dtype=torch.float32).view(1, 1, 1, -1).requires_grad_()
 
 
 def stages(height=8, width=16):
-    """A prediction that knows nothing: all levels alike, 5 px everywhere, confidence a half."""
+    """Return an uninformed prediction: equal levels, 5 px everywhere, a confidence of one half."""
     maps = {
         "correlation": torch.zeros(2, LEVELS, height // 4, width // 4),
         "scores": torch.zeros(2, LEVELS, height // 4, width // 4),
@@ -62,8 +62,8 @@ def test_regression_is_the_absolute_error_less_a_quarter_and_square_below_half_a
     assert found.item() == pytest.approx((0.2**2 + 0.75 + 2.75) / 3, abs=1e-6)
 
 
-def test_confidence_is_asked_whether_the_error_is_within_one_pixel():
-    logit = a_map(math.log(3), math.log(3), 0.0, 5.0)  # claims 3/4, 3/4, 1/2
+def test_confidence_predicts_whether_the_error_is_within_one_pixel():
+    logit = a_map(math.log(3), math.log(3), 0.0, 5.0)  # probabilities 3/4, 3/4, 1/2
     found = confidence_loss(logit, a_map(10.9, 12.0, 9.0, 1.0), a_map(10.0, 10.0, 10.0, NAN))
     expected = -(math.log(3 / 4) + math.log(1 / 4) + math.log(1 / 2)) / 3
     assert found.item() == pytest.approx(expected, abs=1e-6)
@@ -81,7 +81,7 @@ def test_halved_truth_is_the_mean_of_a_block_and_unknown_at_edges():
     torch.testing.assert_close(halve(truth_px), expected, equal_nan=True)
 
 
-def test_a_mean_over_nothing_is_zero_and_pulls_nowhere():
+def test_a_mean_over_nothing_is_zero_without_a_gradient():
     values = a_map(1.0, 2.0)
     mean = masked_mean(values, torch.zeros(1, 1, 1, 2, dtype=torch.bool))
     mean.backward()
@@ -89,7 +89,7 @@ def test_a_mean_over_nothing_is_zero_and_pulls_nowhere():
     assert values.grad.tolist() == [[[[0, 0]]]]
 
 
-def test_the_terms_of_a_prediction_that_knows_nothing():
+def test_the_terms_of_an_uninformed_prediction():
     # 8 px are level 2; columns 0 to 7 have no match, but the levels are all alike. Each error is 3 px.
     terms = weave_losses(stages(), *flat_truth(8.0))
     expected = {
@@ -115,7 +115,7 @@ def test_unknown_truth_gives_no_nan_gradient_and_does_not_count():
     assert not predicted.confidence_logit.grad[:, :, 2:7, 3:11].any()
 
 
-def test_truth_that_is_all_unknown_costs_nothing():
+def test_truth_that_is_all_unknown_has_no_loss():
     predicted = stages()
     truth_px, occluded = flat_truth(NAN)
     total = torch.stack(list(weave_losses(predicted, truth_px, occluded).values())).sum()
@@ -127,7 +127,7 @@ def test_truth_that_is_all_unknown_costs_nothing():
 def test_occluded_pixels_do_not_touch_the_correlation_term():
     predicted = stages()
     truth_px, occluded = flat_truth(0.0)
-    occluded[0, 0, 5, 9] = True  # the pixel that stands for row 1, column 2 at a quarter of the resolution
+    occluded[0, 0, 5, 9] = True  # the pixel for row 1, column 2 at a quarter of the resolution
     terms = weave_losses(predicted, truth_px, occluded)
     torch.stack(list(terms.values())).sum().backward()
     touched = predicted.correlation.grad.abs().sum(1) > 0

@@ -1,4 +1,4 @@
-"""What a recipe minimises: equation (5) worked out by hand on a picture of two columns, and its scores."""
+"""Training objectives of recipes: equation (5), worked out by hand on small pictures, and the scores."""
 
 from dataclasses import replace
 
@@ -27,7 +27,7 @@ DEPTH = recipe_of("fast_depth", target="depth", max_depth_m=8.0, exponent=2.0, a
 
 
 class Constant(nn.Module):
-    """A network of one parameter: it gives everywhere what it was told, once for each output."""
+    """A network that returns given constants everywhere, one for each output."""
 
     def __init__(self, predicts, *values, output_weights=(1.0,)):
         super().__init__()
@@ -42,7 +42,7 @@ class Constant(nn.Module):
 
 
 def batch_of(disparity_px, focal_baseline_px_m=None, doffs_px=None):
-    """Pictures of one row and three columns: 0, 0.5 and 1 on the left, 0, 0 and 1 on the right."""
+    """Return a batch of one row and three columns: 0, 0.5 and 1 on the left, 0, 0 and 1 on the right."""
     truth_px = torch.tensor(disparity_px)[:, None, None]
     left = torch.tensor([0.0, 0.5, 1.0]).expand(len(truth_px), 3, 1, 3)
     right = torch.tensor([0.0, 0.0, 1.0]).expand(len(truth_px), 3, 1, 3)
@@ -106,8 +106,8 @@ def test_a_depth_moves_the_pixels_of_each_sample_by_its_own_disparity():
 
 @pytest.mark.parametrize(("value_px", "depth_m"), [(1.0, 4.0), (0.5, 8.0), (0.0, 16.0), (-3.0, 64.0)])
 def test_pixels_beyond_the_greatest_depth_go_on_along_the_tangent(value_px, depth_m):
-    """A network whose first answers are all about 0 px, or behind the camera, is drawn to where depth is."""
-    # f B = 4 px m: 8 m at 0.5 px, where depth falls by 16 m a pixel.
+    """A network whose first outputs are near 0 px, or behind the camera, gets a gradient to the truth."""
+    # f B = 4 px m: 8 m at 0.5 px, where depth falls by 16 m per pixel.
     batch, network = batch_of([[1.0, 2.0, torch.nan]], [4.0], [0.0]), Constant("disparity_px", value_px)
     objective = CodeObjective(DEPTH, network)
     depth = objective.quantity(objective.predict(network, batch)[0], batch)
@@ -148,7 +148,7 @@ def test_unknown_pixels_change_neither_value_nor_gradient(loss):
     assert np.isfinite(found).all() and found[0][1] != 0
 
 
-def test_smooth_l1_turns_at_one_pixel():
+def test_smooth_l1_switches_at_one_pixel():
     recipe = replace(DISPARITY, loss="smooth_l1", exponent=1.0, alpha_p=0.0)
     # Errors of 1 px and 3 px of 4 px; a corner at 1/4 takes half of that off.
     losses = losses_of(recipe, Constant("disparity_px", 1.0), batch_of(TRUTH_PX))
@@ -168,7 +168,7 @@ def test_with_psmnet_s_settings_the_loss_is_its_own_in_units_of_the_range():
 
 
 @pytest.mark.parametrize("recipe", [DISPARITY, DEPTH], ids=["disparity", "depth"])
-def test_code_quantity_and_disparity_say_the_same(recipe):
+def test_code_quantity_and_disparity_agree(recipe):
     batch = batch_of([[1.0, 2.0, 4.0]], [4.0], [-0.25])
     truth = compute_target(recipe, batch)
     code = build_curve(recipe).encode(truth)
@@ -240,7 +240,7 @@ def test_cross_entropy_is_refused_for_pixels_which_may_leave_their_range():
     recipe = replace(DISPARITY, loss="cross_entropy")
     assert complaint(build_objective, recipe, Constant("disparity_px", 2.0)) == (
         "tiny: loss = 'cross_entropy', expected a network that predicts codes, found model = "
-        f"{recipe.model!r}, whose pixels may leave their range; take another loss"
+        f"{recipe.model!r}, whose disparities may leave their range; choose another loss"
     )
     assert build_objective(recipe, Constant("code", 0.5)).recipe == recipe
 
@@ -261,7 +261,7 @@ def test_a_perceptual_loss_without_its_file_is_refused(tmp_path):
 
 
 def sample_of(disparity_px, camera=CAMERA):
-    """A grey pair with this disparity."""
+    """Return a sample of a grey pair with this disparity."""
     disparity_px = np.asarray(disparity_px, np.float32)
     grey, hidden = np.full((*disparity_px.shape, 3), 99, np.uint8), np.zeros(disparity_px.shape, bool)
     return Sample(
@@ -294,7 +294,7 @@ def test_an_exponent_is_fitted_to_the_truth_of_the_training_pairs(target, expone
 
 
 def scores_of(recipe, value_px):
-    """Scores of a constant on two pairs: of 4 px and, in a quarter of it, 12 px; and of 4 px alone."""
+    """Return the scores of a constant on two pairs: one of 4 px with a quarter at 12 px, and one of 4 px."""
     pairs = Listed(
         [replace(box_before_a_wall(np.random.default_rng(0)), camera=CAMERA), sample_of([[4.0, 4.0]])]
     )

@@ -11,7 +11,7 @@ SHAPES = {"0": (64, 3), "2": (64, 64), "5": (128, 64), "7": (128, 128)}
 
 
 def weights(seed=0):
-    """Random weights of the true shapes, and a later layer's that the loss does not need."""
+    """Return random weights of the true shapes, and those of a later layer that the loss does not need."""
     generator = torch.Generator().manual_seed(seed)
     state = {"features.10.weight": torch.zeros(256, 128, 3, 3), "classifier.6.bias": torch.zeros(1000)}
     for layer, shape in SHAPES.items():
@@ -23,7 +23,7 @@ def weights(seed=0):
 
 
 def a_wire():
-    """Weights that hand the red channel through, raised by 3 so that no ReLU cuts it; all else is 0."""
+    """Return weights that pass the red channel on, raised by 3 so that no ReLU cuts it; all others are 0."""
     state = {name: torch.zeros_like(tensor) for name, tensor in weights().items()}
     for layer in SHAPES:
         state[f"features.{layer}.weight"][0, 0, 1, 1] = 1
@@ -61,13 +61,13 @@ def test_features_are_pooled_once(tmp_path):
 
 def test_black_is_normalised_as_imagenet_is(tmp_path):
     state = a_wire()
-    state["features.0.bias"][0] = 0  # what is below the mean is cut, 0.485 in red
+    state["features.0.bias"][0] = 0  # values below the mean, 0.485 in red, are cut
     loss = PerceptualLoss(saved(tmp_path, state))
     found = loss(torch.full((1, 1, 8, 8), 0.585), torch.zeros(1, 1, 8, 8))
     assert found.item() == pytest.approx((0.1 / 0.229) ** 2 / 128, rel=1e-4)
 
 
-def test_a_code_that_is_the_truth_costs_nothing(loss):
+def test_a_code_equal_to_the_truth_has_no_loss(loss):
     code, other = random_maps(2, 1, 12, 10)
     assert loss(code, code).item() == 0
     assert loss(code, other).item() > 0
@@ -76,7 +76,7 @@ def test_a_code_that_is_the_truth_costs_nothing(loss):
 def test_the_gradient_is_that_of_the_value(loss):
     code, truth = (values.double() for values in random_maps(1, 1, 4, 4))
     truth[0, 0, 1, 2] = math.nan
-    # The replaced pixel is the prediction itself, held still: as a constant here, where it is not moved.
+    # The replaced pixel is the detached prediction, a constant here, because it is not moved.
     held = code.clone()
     known = truth.isfinite()
     loss.double()
@@ -107,7 +107,7 @@ def test_half_of_the_pixels_known_weigh_as_much_as_all(tmp_path):
     assert loss(code, truth).item() == pytest.approx((0.2 / 0.229) ** 2 / 128, rel=1e-5)
 
 
-def test_truth_that_is_all_unknown_costs_nothing_and_pulls_nowhere(loss):
+def test_truth_that_is_all_unknown_has_no_loss_and_no_gradient(loss):
     code, _ = random_maps(1, 1, 8, 8)
     found = loss(code.requires_grad_(), torch.full((1, 1, 8, 8), math.nan))
     found.backward()
@@ -146,7 +146,7 @@ def refused(path):
     return message
 
 
-def test_a_missing_file_says_which_one_is_expected_and_that_nobody_fetches_it(tmp_path):
+def test_the_error_for_a_missing_file_says_which_one_is_expected_and_never_downloaded(tmp_path):
     assert "never downloaded automatically" in refused(tmp_path / "none.pth")
 
 

@@ -10,7 +10,7 @@ from stereoweave.learn.training.scores import validate, validate_by_class
 
 
 class Constant(nn.Module):
-    """Finds 5 px everywhere, and is sure of it by 3 to 1."""
+    """A network that returns 5 px everywhere, with a confidence of 3/4."""
 
     def forward(self, left, right):
         flat = torch.zeros_like(left[:, :1])
@@ -18,7 +18,7 @@ class Constant(nn.Module):
 
 
 def test_scores_are_those_of_the_left_views(tmp_path):
-    # Of each left view a quarter is the box at 12 px, the rest the wall at 4 px: errors of 7 and 1 px.
+    # A quarter of each left view is the box at 12 px, the rest the wall at 4 px: errors of 7 and 1 px.
     pairs = keep_pairs(tmp_path, 0, 2)
     scores = validate(Constant(), pairs, torch.device("cpu"))
     expected = {
@@ -26,7 +26,7 @@ def test_scores_are_those_of_the_left_views(tmp_path):
         "bad1_percent": 25,
         "bad2_percent": 25,
         "d1_percent": 25,
-        "calibration_error": 0,  # 3 to 1 it is
+        "calibration_error": 0,  # three quarters are right
     }
     assert scores == pytest.approx(expected, abs=1e-6)
 
@@ -43,11 +43,11 @@ def test_scores_by_class_add_up_and_leave_out_what_the_network_cannot_reach(tmp_
     network.max_disparity_px = 192
     scores = validate_by_class(network, pairs, torch.device("cpu"))
     assert scores["epe_px"] == pytest.approx(0.25 * 7 + 0.75 * 1)
-    # Off by over 1 px is the box alone, none of which is hidden.
+    # Only the box, no part of which is occluded, is off by over 1 px.
     assert scores["bad1_percent"] == pytest.approx(25)
     classes = [scores[f"{name}_bad1_percent"] for name in CLASSES]
     assert sum(classes) == pytest.approx(25)
     assert classes[:2] == [0, 0]
-    # A network that reaches 8 px is asked for the wall alone.
+    # A network whose range ends at 8 px is scored only on the wall.
     network.max_disparity_px = 8
     assert validate_by_class(network, pairs, torch.device("cpu"))["epe_px"] == pytest.approx(1)

@@ -1,4 +1,4 @@
-"""Training by the clock: the schedule, the state that travels, and a command that is killed."""
+"""Training by the clock: schedule, state files, and resumption after a killed command."""
 
 import json
 import math
@@ -50,7 +50,7 @@ SCHEDULE = replace(RECIPE, learning_rate=0.01, warm_up_steps=4, steps=1000, cool
 
 
 def batch():
-    """Two pairs as `Painters` hands them over."""
+    """Return a batch of two pairs, as `Painters` returns it."""
     samples = [box_before_a_wall(np.random.default_rng(seed)) for seed in range(2)]
     made = collate(samples)
     images = {side: (made[side] * 255).round().to(torch.uint8) for side in ("left", "right")}
@@ -104,7 +104,7 @@ def test_a_pair_comes_as_often_as_it_is_to_be_cut():
     reused.cuts = 2.5
     counts = Counter(id(reused[index]) for index in range(5000))
     assert 5000 / len(counts) == pytest.approx(2.5, rel=0.1)
-    assert max(counts.values()) < 20  # none stays for good
+    assert max(counts.values()) < 20  # every pair is replaced at some point
 
 
 def test_larger_crops_come_from_larger_pairs_in_smaller_batches():
@@ -153,7 +153,7 @@ def test_weights_that_are_not_finite_are_not_written(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_the_files_of_a_run_are_where_another_goes_on(tmp_path):
+def test_another_run_resumes_from_the_files(tmp_path):
     (tmp_path / "out").mkdir()
     run = run_of()
     step(run)
@@ -169,7 +169,7 @@ def test_the_files_of_a_run_are_where_another_goes_on(tmp_path):
     )
 
 
-def test_of_two_folders_the_one_that_is_further_counts(tmp_path):
+def test_of_two_folders_the_run_that_is_further_ahead_is_resumed(tmp_path):
     run = run_of()
     for name, seconds in (("out", 10.0), ("earlier", 20.0)):
         (tmp_path / name).mkdir()
@@ -177,11 +177,11 @@ def test_of_two_folders_the_one_that_is_further_counts(tmp_path):
     (tmp_path / "earlier" / OPTIMISER_FILE).unlink()
     found = find_resume_point(RECIPE, tmp_path / "out", tmp_path / "earlier", "")
     assert found.progress.seconds == 20
-    # Without its state the optimiser warms up again.
+    # Without its state, the optimiser warms up again.
     assert (found.optimiser, found.progress.optimiser_steps) == ({}, 0)
 
 
-def test_what_cannot_be_gone_on_from_is_named(tmp_path):
+def test_files_from_which_no_run_can_resume_are_named(tmp_path):
     assert "copy all of its files" in complaint(find_resume_point, RECIPE, tmp_path / "out", tmp_path, "")
     run_of().save(tmp_path, RunProgress(), 0.0, {})
     other = replace(RECIPE, model="weave_base")
@@ -193,7 +193,7 @@ def test_what_cannot_be_gone_on_from_is_named(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["base", "small"])
-def test_what_is_brought_back_is_below_16_mib_a_file(name, tmp_path, monkeypatch):
+def test_every_file_of_a_run_is_below_16_mib(name, tmp_path, monkeypatch):
     monkeypatch.chdir(GPU.parents[1])
     recipe = read_recipe(GPU / f"{name}.toml")
     start = find_resume_point(recipe, tmp_path, None, "").checkpoint
@@ -206,7 +206,7 @@ def test_what_is_brought_back_is_below_16_mib_a_file(name, tmp_path, monkeypatch
 
 
 class Seconds:
-    """A clock that a test turns on by a second whenever it is read."""
+    """A clock that advances by a second whenever it is read."""
 
     def __init__(self):
         self.now_s = 0.0
@@ -217,7 +217,7 @@ class Seconds:
 
 
 def dataset(folder):
-    """Frames whose depth is known, and a recipe file for them: they cost nothing to read."""
+    """Write frames of known depth, which are fast to read. Returns a recipe file for them."""
     for number in range(4):
         for side, shade in (("left", 90), ("right", 100)):
             write_picture(folder / "set" / side / f"{number}.png", shade, (32, 48))
@@ -262,7 +262,7 @@ def test_painters_go_on_when_one_of_them_is_killed(tmp_path):
     assert not multiprocessing.active_children()
 
 
-def test_a_command_that_is_killed_is_gone_on_from_to_the_end_of_the_time(tmp_path, monkeypatch):
+def test_a_killed_command_is_resumed_until_the_time_is_over(tmp_path, monkeypatch):
     recipe_file, out = dataset(tmp_path), tmp_path / "killed"
     call = [sys.executable, str(GPU / "train.py"), str(recipe_file), "--out", str(out)]
     with (tmp_path / "log").open("w") as log:
@@ -299,7 +299,7 @@ def test_a_command_that_is_killed_is_gone_on_from_to_the_end_of_the_time(tmp_pat
     assert last.scores["epe_px"] < math.inf
     assert any("smoke test passed" in line for line in lines)
     assert "minutes used up" in lines[-1]
-    # The same command again finds that no time is left.
+    # The same command, run again, finds that no time is left.
     again = train_by_clock(read_recipe(recipe_file), replace(command, earlier=None), lines.append)
     assert again == progress
     assert "minutes are used" in lines[-1]

@@ -8,7 +8,7 @@ from stereoweave.learn.training.warp import depth_to_disparity, reconstruct_left
 
 
 def reconstructed_plainly(right, disparity_px):
-    """The same, pixel by pixel: image [B, C, H, W], zero where it does not exist, and what exists."""
+    """Reconstruct pixel by pixel. Returns the image [B, C, H, W], 0 without a match, and the match mask."""
     image, exists = np.zeros_like(right), np.zeros(disparity_px.shape, bool)
     width = right.shape[3]
     for b, _, j, i in np.ndindex(disparity_px.shape):

@@ -1,4 +1,4 @@
-"""WeaveNet's loss as a recipe may change it: at its defaults it is what test_losses.py works out."""
+"""WeaveNet's loss with settings of recipes; test_losses.py works out the loss at its defaults."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ LEVELS = 4
 
 
 def prediction(estimate_px=5.0, level_px=4, height=16, width=32):
-    """The same disparity everywhere, all levels alike."""
+    """Return a prediction of one disparity everywhere, with equal levels."""
     maps = {
         "correlation": torch.zeros(2, LEVELS, height // level_px, width // level_px),
         "scores": torch.zeros(2, LEVELS, height // level_px, width // level_px),
@@ -98,6 +98,6 @@ def test_levels_at_an_eighth_are_of_8_px_and_looked_up_in_the_middle_of_their_pi
     predicted = prediction(level_px=8)
     scores = 50 * torch.eye(LEVELS)[None, :, None].expand(2, -1, 2, -1)  # level i at column i
     assert losses_of(replace(predicted, scores=scores), batch)["scores"].item() == pytest.approx(0, abs=1e-6)
-    # The other way round every column has another one's level.
+    # Reversed, every column has the level of another one.
     losses = losses_of(replace(predicted, scores=scores.flip(3)), batch)
     assert losses["scores"].item() == pytest.approx(50)
