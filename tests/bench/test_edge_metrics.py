@@ -38,7 +38,7 @@ def test_around_a_single_dot_all_but_the_corners_of_a_square_of_7_are_near_it():
     np.testing.assert_array_equal(near_edge(truth_px), expected)
 
 
-def test_a_step_of_two_pixels_is_none_and_a_larger_one_is():
+def test_a_step_of_two_pixels_is_no_edge_and_a_larger_one_is():
     truth_px = np.zeros((1, 20))
     truth_px[0, 10:] = 2
     assert not near_edge(truth_px).any()
@@ -47,7 +47,7 @@ def test_a_step_of_two_pixels_is_none_and_a_larger_one_is():
 
 
 @pytest.mark.parametrize("unknown", [np.nan, np.inf])
-def test_what_is_unknown_is_neither_a_side_of_an_edge_nor_near_one(unknown):
+def test_unknown_pixels_are_neither_a_side_of_an_edge_nor_near_one(unknown):
     truth_px = step_between_columns_7_and_8()
     truth_px[:, 8] = unknown
     assert not near_edge(truth_px).any()
@@ -68,13 +68,13 @@ def test_errors_are_those_of_the_six_columns_near_the_edge():
 def test_a_pixel_flies_when_it_is_over_2_px_from_both_sides_of_its_edge():
     truth_px = step_between_columns_7_and_8()
     estimate_px = truth_px.copy()
-    # On its side, on the other side, between; too far behind, 2 px off, too far before. Column 0 is not near.
+    # On its own side, on the other, between, too far back, 2 px off, too far in front; column 0 is not near.
     estimate_px[:, 5:11] = [10, 20, 15, 7.9, 12, 22.1]
     estimate_px[:, 0] = 15
     assert flying_percent(estimate_px, truth_px) == pytest.approx(50)
 
 
-def test_a_slanted_side_does_no_harm():
+def test_a_slanted_side_has_no_flying_pixels():
     truth_px = step_between_columns_7_and_8()
     truth_px[:, 8:] += 1.5 * np.arange(8)
     assert near_edge(truth_px)[0].sum() == 6
@@ -91,18 +91,18 @@ def test_a_third_surface_in_the_window_is_a_surface_too():
 def test_interpolation_over_an_edge_makes_flying_pixels_and_a_moved_edge_does_not():
     truth_px = step_between_columns_7_and_8()
     ramp_px = np.broadcast_to(np.interp(np.arange(16), [5, 10], [BEHIND_PX, BEFORE_PX]), truth_px.shape)
-    # 10, 12, 14, 16, 18, 20 in the six columns near it.
+    # The six columns near the edge become 10, 12, 14, 16, 18 and 20.
     assert flying_percent(ramp_px, truth_px) == pytest.approx(100 * 2 / 6)
     assert flying_percent(np.roll(truth_px, 2, axis=1)[:, 2:], truth_px[:, 2:]) == 0
 
 
-def test_an_estimate_of_nan_flies():
+def test_an_estimate_of_nan_is_flying():
     truth_px = step_between_columns_7_and_8()
     assert flying_percent(np.full_like(truth_px, np.nan), truth_px) == 100
 
 
 @pytest.mark.parametrize("truth_px", [np.full((4, 9), 7.0), np.full((4, 9), np.nan)])
-def test_without_an_edge_there_is_no_number(truth_px):
+def test_without_an_edge_every_metric_is_nan(truth_px):
     estimate_px = np.zeros((4, 9))
     assert math.isnan(edge_epe_px(estimate_px, truth_px))
     assert math.isnan(edge_bad_percent(estimate_px, truth_px, 1))

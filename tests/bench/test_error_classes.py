@@ -8,7 +8,7 @@ from stereoweave.bench.metrics import bad_percent, epe_px
 
 
 def wall_and_box():
-    """A wall of 2 px, and before it a box of 8 px in columns 20 to 35, over all 80 rows."""
+    """Return the disparity of a wall at 2 px, with a box at 8 px in columns 20 to 35 of all 80 rows."""
     truth_px = np.full((80, 48), 2.0, np.float32)
     truth_px[:, 20:36] = 8
     return truth_px
@@ -19,7 +19,7 @@ def columns(mask, row):
 
 
 def ramps():
-    """Grey that stays the same in rows 0 to 19, then rises by 1.5 levels a row, and by 4 from row 50 on."""
+    """Return a grey image: constant in rows 0 to 19, rising by 1.5 levels per row, and by 4 from row 50."""
     levels = np.concatenate([np.zeros(20), 1.5 * np.arange(1, 31), 45 + 4 * np.arange(1, 31)])
     return np.broadcast_to(levels.astype(np.uint8)[:, None, None], (80, 48, 3)).copy()
 
@@ -59,14 +59,14 @@ def test_a_rod_less_than_15_px_wide_is_thin_to_its_middle(width, is_thin):
         assert middle.nonzero()[0].tolist() == inside
 
 
-def test_what_is_over_one_px_farther_in_the_same_right_column_is_covered():
+def test_a_pixel_over_one_px_farther_in_the_same_right_column_is_covered():
     # Matches at columns 0, 1, 1, 3: the second pixel's is covered where the third is over 1 px nearer.
     np.testing.assert_array_equal(
         find_covered(np.array([[0.0, 0.0, 1.2, 0.0]])), [[False, True, False, False]]
     )
     assert not find_covered(np.array([[0.0, 0.0, 1.0, 0.0]])).any()
     assert not find_covered(np.array([[0.0, 0.0, np.nan, 0.0]])).any()
-    # Both beside the picture, and so covered by nothing.
+    # Both match outside the picture, so nothing covers them.
     assert not find_covered(np.array([[1.0, 5.0, 0.0, 0.0]])).any()
 
 
@@ -78,10 +78,10 @@ def test_each_known_pixel_is_in_one_class_and_no_unknown_one_in_any(unknown):
     np.testing.assert_array_equal(sum(mask.astype(int) for mask in masks.values()), np.isfinite(truth_px))
 
 
-def test_errors_of_a_class_are_points_of_the_whole_and_percent_within():
+def test_errors_of_a_class_are_given_in_points_of_the_whole_and_in_percent_of_the_class():
     truth_px = np.zeros((1, 10))
     truth_px[0, 9] = np.nan
-    truth_px[0, 8] = np.inf  # 8 known pixels, of which the class has 4
+    truth_px[0, 8] = np.inf  # of the 8 known pixels, the class has 4
     estimate_px = np.array([[0.5, 1.5, 2.5, 9.5, 0, 0, 0, 4, 100, 100]])
     masks = {"first": np.arange(10)[None] < 4, "empty": np.zeros((1, 10), bool)}
     found = class_errors(estimate_px, truth_px, masks)
@@ -100,7 +100,7 @@ def test_errors_of_a_class_are_points_of_the_whole_and_percent_within():
 def test_points_of_all_classes_add_up_to_the_whole_estimate():
     truth_px = wall_and_box()
     estimate_px = truth_px + np.random.default_rng(5).normal(0, 2, truth_px.shape).astype(np.float32)
-    estimate_px[3, 4] = np.nan  # bad, and in no mean
+    estimate_px[3, 4] = np.nan  # bad, but not part of a mean
     found = class_errors(estimate_px, truth_px, classify(ramps(), truth_px))
     classes = [found[name] for name in CLASSES]
     assert sum(errors.share_percent for errors in classes) == pytest.approx(100)
@@ -114,7 +114,7 @@ def test_points_of_all_classes_add_up_to_the_whole_estimate():
     assert sum(means_px) == pytest.approx(epe_px(estimate_px, truth_px))
 
 
-def test_where_nothing_is_known_every_number_is_unknown():
+def test_without_known_pixels_every_number_is_nan():
     truth_px = np.full((8, 16), np.nan)
     found = class_errors(np.zeros((8, 16)), truth_px, classify(np.zeros((8, 16, 3), np.uint8), truth_px))
     assert all(math.isnan(errors.share_percent) and math.isnan(errors.epe_px) for errors in found.values())

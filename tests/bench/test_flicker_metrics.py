@@ -39,7 +39,7 @@ def test_flicker_at_rest_is_the_mean_absolute_change():
     assert flicker(row(1, 2, 3, 4), row(2, 2, 1, 5), REST, ALL) == 1.0  # of 1, 0, 2, 1
 
 
-def test_what_moves_as_it_truly_does_does_not_flicker():
+def test_true_motion_is_no_flicker():
     before, after = row(7, 9, 1, 1), row(1, 7, 9, 1)
     visible = np.array([[True, True, True, False]])
     assert flicker(before, after, to_the_right(1, 1, 1, 1), visible) == 0.0
@@ -58,7 +58,7 @@ def test_a_true_change_of_disparity_is_no_flicker_and_neither_is_an_error_that_s
     assert flicker(truth_px, truth_px, REST, ALL, nearing_px) == 1.5  # of 0, 0, 3, 3
 
 
-def test_flicker_of_a_picture_is_the_mean_over_its_channels():
+def test_flicker_of_an_image_is_the_mean_over_its_channels():
     before = np.zeros((1, 4, 3), np.uint8)
     after = before.copy()
     after[0, 1] = 3, 6, 9
@@ -66,7 +66,7 @@ def test_flicker_of_a_picture_is_the_mean_over_its_channels():
     assert flicker(before, after, REST, np.array([[False, True, False, False]])) == 6.0
 
 
-def test_flicker_of_no_point_is_nan():
+def test_flicker_without_points_is_nan():
     assert np.isnan(flicker(row(1, 2, 3, 4), row(1, 2, 3, 4), REST, ~ALL))
 
 
@@ -81,7 +81,7 @@ def test_a_point_is_seen_again_inside_and_where_its_own_surface_is():
     before_px, after_px = row(5, 5, 5, 5), row(5, 9, 5, 5)
     found = find_seen_again(before_px, after_px, to_the_right(0, 0, 0, 1), row(0, 0, 0, 0))
     np.testing.assert_array_equal(found, [[True, False, True, False]])  # stays; is covered; stays; leaves
-    # Between two pixels both have to show it.
+    # Between two pixels, both must show the surface.
     found = find_seen_again(before_px, after_px, to_the_right(0.5, 1, 0.5, 0), row(0, 0, 0, 0))
     np.testing.assert_array_equal(found, [[False, True, True, True]])
     assert find_seen_again(before_px, after_px, REST, row(4, 4, 4, 4)).tolist() == [
@@ -105,7 +105,7 @@ def test_a_camera_that_steps_aside_moves_points_by_their_share_of_the_baseline()
 
 
 @pytest.mark.parametrize("position", [LEFT, MIDDLE])
-def test_a_camera_that_goes_half_the_way_doubles_disparity_and_size(position):
+def test_a_camera_that_moves_half_way_to_a_wall_doubles_disparity_and_size(position):
     nearer = replace(RIG, position_m=np.array([0, 0, 0.5]))
     change = reproject(np.full((31, 41), 10, np.float32), RIG, nearer, position)  # 1 m away
     np.testing.assert_allclose(at(change, 30, 12), [10, -3, 10], atol=1e-5)
@@ -120,7 +120,7 @@ def test_a_camera_that_turns_moves_even_the_sky():
 
 @pytest.fixture
 def three_frames(rng):
-    """A video of three frames of which `freeze` and `add_passing_oval` take the first: a plane at 4 px."""
+    """Return a video of three frames; the first, which `freeze` and `add_passing_oval` use, is a plane."""
     image = rng.integers(0, 256, (96, 128, 3), dtype=np.uint8)
     flat_px = np.full((96, 128), 4, np.float32)
     return RenderedVideo(
@@ -146,14 +146,14 @@ def test_a_still_video_does_not_change_and_its_noise_does(three_frames):
         assert np.std(a.astype(float) - b) == pytest.approx(np.sqrt(2) * NOISE_LEVELS, rel=0.03)
 
 
-def test_what_passes_is_where_its_truth_says(three_frames):
+def test_the_passing_oval_is_where_its_truth_says(three_frames):
     video = add_passing_oval(three_frames, "passing", (4.0, 2.0), nearing_px=2.0)
     assert not video.moving[0].all()
     for frame, near_px in enumerate((12, 14, 16)):
         oval = video.moving[frame]
         np.testing.assert_array_equal(video.disparities_px[frame][LEFT], np.where(oval, near_px, 4))
         rows, columns = np.nonzero(oval)
-        # An oval of 32 x 24 px, whose rim it shares with what is behind.
+        # An oval of 32 x 24 px, whose rim pixels are mixed with the background.
         assert len(rows) == pytest.approx(np.pi / 4 * 32 * 24, rel=0.1)
         middle = (np.abs(rows - rows.mean()) < 6) & (np.abs(columns - columns.mean()) < 8)
         rows, columns = rows[middle], columns[middle]
@@ -164,7 +164,7 @@ def test_what_passes_is_where_its_truth_says(three_frames):
             np.testing.assert_array_equal(pair.left[rows, columns], earlier[rows - 2, columns - 4])
 
 
-def test_what_passes_covers_and_uncovers(three_frames):
+def test_the_passing_oval_covers_and_uncovers_the_background(three_frames):
     video = add_passing_oval(three_frames, "passing", (4.0, 0.0))
     before, after = video.moving[0], video.moving[1]
     np.testing.assert_array_equal(video.find_seen_again(0, 1, LEFT) | (after & ~before), np.ones_like(before))
@@ -174,7 +174,7 @@ def test_what_passes_covers_and_uncovers(three_frames):
     assert not motion_px[~before].any() and not change_px.any()
 
 
-def test_what_comes_nearer_moves_less_to_the_right_in_the_middle_view(three_frames):
+def test_an_oval_that_comes_nearer_moves_less_to_the_right_in_the_middle_view(three_frames):
     video = add_passing_oval(three_frames, "nearing", (3.25, 0.0), nearing_px=0.5)
     motion_px, change_px = video.change(0, 1, MIDDLE)
     assert motion_px[..., 0].max() == 3.0
@@ -195,7 +195,7 @@ def test_a_rendered_pan_looks_the_same_along_its_true_motion():
 
 
 @pytest.mark.needs_egl
-def test_the_rows_say_what_steadying_is_worth():
+def test_the_rows_show_the_effect_of_the_temporal_filter():
     rows = list(score_flicker(["rooms"], frames=4, size_px=(160, 120), seed=3, threads=1))
     assert [row.film for row in rows[::2]] == ["still", "passing", "nearing", "panning"]
     assert [row.method for row in rows] == [FRAME_BY_FRAME, STEADY] * 4

@@ -49,7 +49,7 @@ def test_a_mean_over_no_pixel_is_nan():
     assert math.isnan(metrics.depth_error_m(estimate, unknown))
 
 
-def test_an_estimate_of_nan_is_no_hit():
+def test_an_estimate_of_nan_is_bad():
     truth_px, estimate_px = np.array([[10.0, 20.0]]), np.array([[10.0, np.nan]])
     assert metrics.bad_percent(estimate_px, truth_px, 1) == 50
     assert metrics.d1_percent(estimate_px, truth_px) == 50
@@ -121,18 +121,18 @@ def test_picture_scores_are_those_of_the_referee(testdata, scene):
     assert metrics.ssim(left, right) == pytest.approx(referee["ssim"](left, right), abs=1e-6)
 
 
-def test_calibration_error_is_the_mean_gap_between_claim_and_outcome():
+def test_calibration_error_is_the_mean_gap_between_probability_and_frequency():
     probability = np.array([0.95, 0.95, 0.95, 0.95, 0.05, 0.05])
     happened = np.array([True, True, True, False, False, False])
-    # Four claims of 0.95 came true 3 times in 4, two claims of 0.05 never: (4 * 0.20 + 2 * 0.05) / 6.
+    # Four events of probability 0.95 happened 3 times in 4, two of 0.05 never: (4 * 0.20 + 2 * 0.05) / 6.
     assert metrics.calibration_error(probability, happened) == pytest.approx(0.15)
 
 
-def test_the_calibration_error_of_no_claim_is_nan():
+def test_the_calibration_error_of_no_value_is_nan():
     assert math.isnan(metrics.calibration_error(np.ones(0), np.ones(0, bool)))
 
 
-def test_sparsification_gives_the_mean_error_of_what_is_kept():
+def test_sparsification_is_the_mean_error_of_the_pixels_that_remain():
     error_px = np.array([1.0, 4.0, 2.0, 3.0])
     best = metrics.sparsification(error_px, np.array([0.9, 0.1, 0.6, 0.5]))
     worst = metrics.sparsification(error_px, np.array([-9.0, 3.0, 1.0, 2.0]))
@@ -154,7 +154,7 @@ def test_pixels_of_equal_confidence_are_dropped_in_any_order():
     np.testing.assert_allclose(metrics.sparsification(error_px, np.zeros(4)).kept, 1.5)
 
 
-def test_the_curve_of_no_pixel_is_nan():
+def test_the_curve_without_pixels_is_nan():
     nothing = metrics.sparsification(np.ones(0), np.ones(0))
     assert np.isnan(nothing.kept).all()
     assert math.isnan(nothing.ause)

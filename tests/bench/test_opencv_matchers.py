@@ -35,7 +35,7 @@ def test_a_hole_takes_the_farther_of_its_neighbours_along_the_row():
     np.testing.assert_array_equal(fill_rows(np.array(holes, np.float32)), filled)
 
 
-def test_confidence_is_what_the_two_views_disagree_by_at_the_match():
+def test_confidence_is_the_disagreement_of_the_two_views_at_the_match():
     left_px = np.array([[HOLE, 2, 2, 1, 1.5, 2.4]], np.float32)
     right_px = np.array([[2.5, 3, HOLE, 9, 9, 9]], np.float32)
     # A hole; its match at column -1; 0 (2.5 there); 2 (a hole there); 2.5, rounded to 2; 3.6, rounded to 4.
@@ -63,7 +63,7 @@ def test_sgbm_is_set_and_filled_as_the_referee_does(testdata):
 
 
 @pytest.mark.testdata
-def test_holes_are_filled_as_the_referee_does_whatever_the_map(testdata, rng):
+def test_holes_of_random_maps_are_filled_as_the_referee_does(testdata, rng):
     fill_rows_plain = runpy.run_path(str(testdata / "referee" / "score_pairs.py"))["fill_rows"]
     for share in (0.0, 0.5, 0.95, 1.0):
         holes = rng.uniform(0.1, 50, (40, 12)).astype(np.float32)

@@ -15,7 +15,7 @@ from stereoweave.stereo import Estimate, StereoPair
 
 
 def scene_of(rng, name="noise", disparity_px=7):
-    """Random dots, all at one disparity."""
+    """Return a scene of random dots, all at one disparity."""
     dots = rng.integers(0, 256, (48, 120, 3), dtype=np.uint8)
     pair = StereoPair(
         left=dots[:, :100], right=np.ascontiguousarray(dots[:, disparity_px : 100 + disparity_px])
@@ -24,17 +24,17 @@ def scene_of(rng, name="noise", disparity_px=7):
 
 
 def scores_of(makers, scenes):
-    """As `score_pairs`, of scenes that are read already."""
+    """Return the result of `score_pairs` for scenes that are already read."""
     return score_pairs(makers, lambda: [partial(lambda scene: scene, scene) for scene in scenes])
 
 
 def constant(disparity_px):
-    """What makes a matcher that finds one disparity everywhere."""
+    """Return the factory of a matcher that finds one disparity everywhere."""
     return lambda: lambda pair: np.full(pair.left.shape[:2], disparity_px, np.float32)
 
 
 def certain(disparity_px, confidence):
-    """What makes one that gives it as an Estimate."""
+    """Return the factory of a matcher that returns one disparity everywhere as an Estimate."""
 
     def match(pair):
         found_px = np.full(pair.left.shape[:2], disparity_px, np.float32)
@@ -54,7 +54,7 @@ def by_matcher(rows, scene=MEAN):
 
 
 def with_step(scene, behind_px):
-    """The scene with another true disparity in its left half."""
+    """Return the scene with another true disparity in its left half."""
     truth_px = scene.truth_px.copy()
     truth_px[:, :50] = behind_px
     return Scene(name=scene.name, pair=scene.pair, truth_px=truth_px)
@@ -114,7 +114,7 @@ def test_times_are_relative_to_sgbm_in_the_same_row(rng):
 
 
 @pytest.mark.parametrize("name", ["sgbm", "files/mean.onnx", "bm.onnx"])
-def test_a_matcher_of_a_name_that_the_table_uses_itself_is_refused(rng, name):
+def test_a_matcher_with_the_name_of_another_row_is_refused(rng, name):
     with pytest.raises(StereoweaveError, match=f"{name}: expected"):
         scores_of({name: constant(1.0)}, [scene_of(rng)])
 
@@ -131,21 +131,21 @@ def test_matchers_take_turns_after_the_calls_that_warm_them_up(rng):
 
     makers = {"map": noted("map", constant(1.0)), "estimate": noted("estimate", certain(1.0, 0.5))}
     scores_of(makers, [scene_of(rng)])
-    # A map's left-right check takes the mirrored pair.
+    # The left-right check of a map matches the mirrored pair too.
     assert calls == ["map", "map", "estimate"] + ["map", "estimate"] * TURNS
 
 
-def test_near_an_edge_a_row_tells_errors_and_flying_pixels(rng):
+def test_a_row_has_the_errors_and_flying_pixels_near_edges(rng):
     scenes = [with_step(scene_of(rng, "step"), 27), scene_of(rng, "flat")]
     rows = scores_of({"between": constant(17.0), "before": constant(27.0)}, scenes).rows
-    for of in (by_matcher(rows, "step"), by_matcher(rows)):  # a flat scene has no part in the mean
+    for of in (by_matcher(rows, "step"), by_matcher(rows)):  # the flat scene is not part of the mean
         assert (of["between"].edge_epe_px, of["before"].edge_epe_px) == (10, 10)
         assert (of["between"].edge_bad1_percent, of["before"].edge_bad1_percent) == (100, 50)
         assert (of["between"].flying_percent, of["before"].flying_percent) == (100, 0)
     assert math.isnan(by_matcher(rows, "flat")["between"].flying_percent)
 
 
-def test_a_probability_is_compared_with_what_came_true_and_a_left_right_check_is_none(rng):
+def test_only_a_probability_has_a_calibration_error(rng):
     scene = with_step(scene_of(rng), 27)
     rows = scores_of({"sure": certain(7.0, 0.9), "map": constant(7.0)}, [scene]).rows
     # Half of the pixels are right.
@@ -153,7 +153,7 @@ def test_a_probability_is_compared_with_what_came_true_and_a_left_right_check_is
     assert math.isnan(by_matcher(rows)["map"].calibration_error)
 
 
-def test_the_area_between_the_curves_is_that_of_the_mean_curves(rng):
+def test_the_mean_row_has_the_area_between_the_mean_curves(rng):
     scenes = [with_step(scene_of(rng, "a"), 27), with_step(scene_of(rng, "b"), 12)]
     scores = scores_of({"flat": certain(7.0, 0.5)}, scenes)
     curves, row = scores.curves["flat"], by_matcher(scores.rows)["flat"]
@@ -165,7 +165,7 @@ def test_the_area_between_the_curves_is_that_of_the_mean_curves(rng):
     assert row.ause_bad1_percent == pytest.approx(95 / 2 - 50 * (1 - math.log(2)), abs=0.02)
 
 
-def test_the_holes_of_a_map_are_its_least_confident_pixels_and_filled(rng):
+def test_the_holes_of_a_map_are_filled_and_least_confident(rng):
     def half():
         def match(pair):
             found_px = np.full(pair.left.shape[:2], 7, np.float32)
@@ -182,7 +182,7 @@ def test_the_holes_of_a_map_are_its_least_confident_pixels_and_filled(rng):
     assert scores.curves["half"].epe_px.kept[-1] == 0
 
 
-def test_a_scene_without_known_disparity_has_no_part_in_the_means(rng):
+def test_a_scene_without_known_disparity_is_left_out_of_the_means(rng):
     scene = scene_of(rng)
     unknown = Scene(name="unknown", pair=scene.pair, truth_px=np.full_like(scene.truth_px, np.nan))
     scores = scores_of({"eight": certain(8.0, 0.5)}, [unknown, scene])
@@ -196,12 +196,12 @@ def test_no_scene_is_an_error():
         scores_of({}, [])
 
 
-def test_a_model_that_is_none_is_an_error_before_any_scene_is_read():
+def test_an_unknown_model_is_an_error_before_any_scene_is_read():
     with pytest.raises(MatcherError, match=r"none.onnx"):
         score_pairs({"none": partial(make_matcher, "none.onnx")}, lambda: pytest.fail("was listed"))
 
 
-def test_memory_stands_in_the_rows_of_means_and_is_that_of_the_largest_pair(rng):
+def test_mean_rows_have_the_memory_for_the_largest_pair(rng):
     small, large = scene_of(rng), scene_of(rng)
     wide = np.tile(large.pair.left, (1, 2, 1))
     large = Scene(

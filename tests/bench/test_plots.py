@@ -15,7 +15,7 @@ from stereoweave.io.images import read_image
 
 @pytest.fixture
 def drawn(monkeypatch):
-    """The figures that were written, in their order."""
+    """Return the figures in the order in which they are written."""
     figures = []
     save = benchmark_plots._save
 
@@ -51,7 +51,7 @@ def test_each_matcher_is_a_point_in_both_panels_networks_apart_from_opencv(tmp_p
     assert (tmp_path / "time.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_names_of_points_that_all_but_coincide_can_be_read(tmp_path, drawn):
+def test_names_of_nearly_coincident_points_do_not_overlap(tmp_path, drawn):
     draw_error_over_time(tmp_path / "time.png", ROWS)
     for axes in drawn[0].axes:
         assert [label.get_text() for label in axes.texts] == ["sgbm", "small", "mine.onnx"]

@@ -12,7 +12,7 @@ def grey(levels):
 
 
 def plain_projection(left, disparity_px):
-    """Pixel by pixel: what lands is kept if it is nearer than what is there."""
+    """Project pixel by pixel; a pixel is replaced by one that is nearer."""
     height, width = disparity_px.shape
     image, nearest_px = np.zeros_like(left), np.full((height, width), -np.inf)
     for y in range(height):
@@ -53,7 +53,7 @@ def test_the_nearer_surface_wins(far_px):
     assert (view.image[0, column] == 40).all()
 
 
-def test_what_leaves_the_picture_is_gone():
+def test_pixels_that_leave_the_picture_are_dropped():
     view = project_right(grey([[10, 20, 30]]), np.array([[1.0, 0.0, -1.0]]))
     np.testing.assert_array_equal(view.image, grey([[0, 20, 0]]))
 
@@ -63,7 +63,7 @@ def test_halves_keep_every_column():
     np.testing.assert_array_equal(view.image, grey([[10, 20, 30, 40]]))
 
 
-def test_unknown_disparity_throws_nothing():
+def test_pixels_of_unknown_disparity_are_not_projected():
     view = project_right(grey([[10, 20, 30, 40]]), np.array([[np.nan, 1.0, np.inf, -np.inf]]))
     np.testing.assert_array_equal(view.drawn, [[True, False, False, False]])
     np.testing.assert_array_equal(view.image, grey([[20, 0, 0, 0]]))
@@ -88,7 +88,7 @@ def test_true_disparity_gives_the_right_photograph_wherever_it_has_a_source(rng)
 
 def test_a_hole_takes_the_next_colour_to_its_right_else_the_last_to_its_left():
     drawn = np.array([[0, 1, 0, 0, 1, 0], [0, 0, 0, 0, 0, 0], [1, 0, 0, 0, 0, 0]], bool)
-    # 99 is what a hole may hold; it must not show.
+    # 99 is the value in holes; it must not show.
     image = grey(np.where(drawn, [[0, 20, 0, 0, 50, 0], [0] * 6, [70] * 6], 99))
     filled = fill_from_rows(View(image=image, drawn=drawn))
     np.testing.assert_array_equal(
@@ -102,7 +102,7 @@ def test_rows_above_the_first_colour_are_black():
     np.testing.assert_array_equal(filled, grey([[0, 0], [7, 7]]))
 
 
-def test_what_a_box_uncovers_is_filled_with_the_wall_behind_it(rng):
+def test_the_area_that_a_box_uncovers_is_filled_with_the_wall_behind_it(rng):
     sample = box_before_a_wall(rng)
     filled = fill_from_rows(project_right(sample.left, sample.disparity_px))
     # The box spans columns 24..71 and moves by 12 to 12..59; the wall behind begins at 72 - 4 = 68.

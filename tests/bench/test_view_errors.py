@@ -16,7 +16,7 @@ WALL_PX, BOX_PX = 4, 12
 
 
 def shifted(rng, shift_px, camera=None):
-    """A sample of one flat wall."""
+    """Return a sample of one flat wall."""
     dots = rng.integers(0, 256, (32, 100 + shift_px, 3), dtype=np.uint8)
     disparity_px = np.full((32, 100), shift_px, np.float32)
     return Sample(
@@ -44,7 +44,7 @@ def test_errors_count_sourced_pixels_alone_and_then_all_after_the_fill():
     image[:, 4:], drawn[:, 4:] = 110, True
     image[:, 4], image[:, 15] = 140, 100
     errors = measure_projection(right, View(image=image, drawn=drawn))
-    # Of the 12 columns with a source one is off by 40, ten by 10 and one by 0; the fill repeats the first.
+    # Of the 12 columns with a source, one is off by 40, ten by 10, one by 0; the fill repeats the first.
     assert errors.mae_sourced == pytest.approx(140 / 12)
     assert errors.sourced_percent == 75
     assert errors.mae_filled == pytest.approx((140 + 4 * 40) / 16)
@@ -87,7 +87,7 @@ def test_without_warping_the_right_view_is_the_left_image(rng):
     assert row.mae_sourced == row.mae_filled == pytest.approx(difference)
 
 
-def test_sgbm_joins_them_with_its_holes_filled(rng):
+def test_sgbm_is_scored_with_its_holes_filled(rng):
     rows = by_method(score_projections({}, [shifted(rng, 7)]))
     # Its first columns see nothing in the right view; the fill gives them the wall's disparity.
     assert rows["sgbm"].epe_px < 0.1
@@ -135,7 +135,7 @@ def test_the_farthest_depth_is_each_sample_s_own_and_what_is_unknown_has_none(rn
     half[:8], half[8:16] = np.nan, 0
     partly = replace(shifted(rng, 10, camera), disparity_px=half)
     rows = by_method(score_projections({"near": constant(20)}, [partly, shifted(rng, 4, camera)]))
-    # At 2 m and at 5 m the walls are the farthest there is; 1 m is 1 m and 4 m before them.
+    # The walls at 2 m and 5 m are the farthest surfaces; the estimate of 1 m is 1 m and 4 m in front of them.
     assert rows["no warping"].epe_cm == 0
     assert rows["near"].epe_cm == pytest.approx(250)
 
@@ -150,7 +150,7 @@ def test_without_a_camera_there_is_no_error_in_centimetres(rng):
     assert np.isnan(by_method(score_projections({}, [shifted(rng, 7)]))["ground truth"].epe_cm)
 
 
-def test_where_the_truth_is_unknown_it_gives_no_source_and_counts_for_no_error(rng):
+def test_unknown_truth_gives_no_source_and_counts_for_no_error(rng):
     sample = shifted(rng, 7)
     half = sample.disparity_px.copy()
     half[:16] = np.nan
@@ -160,12 +160,12 @@ def test_where_the_truth_is_unknown_it_gives_no_source_and_counts_for_no_error(r
 
 
 @pytest.mark.parametrize("name", ["ground truth", "no warping", "sgbm"])
-def test_a_method_of_a_name_that_the_table_uses_itself_is_refused(rng, name):
+def test_a_method_with_the_name_of_a_baseline_is_refused(rng, name):
     with pytest.raises(StereoweaveError, match=f"^{name}: expected a name"):
         score_projections({name: constant(1)}, [shifted(rng, 7)])
 
 
-def test_a_table_of_no_sample_is_refused():
+def test_a_table_without_samples_is_refused():
     with pytest.raises(StereoweaveError, match="samples: expected at least one"):
         score_projections({}, [])
 

@@ -20,13 +20,13 @@ def picture(number, size=SIZE):
 
 @pytest.fixture
 def scene(tmp_path):
-    """The smallest scene of photographs: a pair and a picture half way."""
+    """Write the smallest scene of photographs: a pair and a picture from halfway."""
     for number, name in enumerate(("left", "right", "view_0.5")):
         write_image(tmp_path / "shed" / f"{name}.png", picture(number))
     return tmp_path / "shed"
 
 
-def test_photographs_alone_have_no_disparity_and_stand_in_their_place(scene):
+def test_photographs_alone_have_no_disparity_and_no_offset(scene):
     (found,) = read_view_scenes(scene.parent)
     assert found.name == "shed"
     for number, image in enumerate((found.sample.left, found.sample.right, found.views[0].image)):
@@ -77,7 +77,7 @@ def test_the_pairs_of_rendered_sets_below_a_folder_are_scenes_with_their_views(t
     assert [scene.name for scene in read_view_scenes(tmp_path / "crane")] == ["crane-000000"]
 
 
-def test_a_folder_without_scenes_is_told_apart(tmp_path):
+def test_a_folder_without_scenes_is_refused(tmp_path):
     with pytest.raises(StereoweaveError, match="expected <scene>/left.png below it, or rendered sets, found"):
         read_view_scenes(tmp_path)
 
@@ -126,7 +126,7 @@ def test_a_disparity_of_another_size_is_named(scene):
         "[" * 60_000,
     ],
 )
-def test_offsets_of_another_form_are_named(scene, text):
+def test_malformed_offsets_are_refused(scene, text):
     (scene / "scene.json").write_text(text)
     with pytest.raises(FormatError, match=r'scene\.json: expected JSON whose "offset_px" is') as told:
         next(read_view_scenes(scene.parent))

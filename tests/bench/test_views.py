@@ -15,7 +15,7 @@ from stereoweave.data.samples import make_sample
 from stereoweave.errors import StereoweaveError
 from stereoweave.stereo import Estimate, StereoPair
 
-# What errors of 1 and of 10 grey levels are in dB, and a view without any (metrics.psnr_db).
+# PSNR of errors of 1 and of 10 grey levels, and of a view without errors (metrics.psnr_db).
 LEVEL_DB, TEN_LEVELS_DB, PERFECT_DB = 48.1308036, 28.1308036, 148.1308036
 OURS = ["nearest photograph", "cross-fade", "sgbm", "ground truth"]
 
@@ -29,7 +29,7 @@ def scene_of(sample, *views, name="shed"):
 
 
 def wall(rng, shift_px=4, height=32, width=64):
-    """A plane with dots at a whole disparity, as the two cameras and one half way see it."""
+    """Return a dotted plane at an integer disparity, as the two cameras and one halfway see it."""
     dots = rng.integers(0, 256, (height, width + shift_px, 3), np.uint8)
     left, middle, right = (
         np.ascontiguousarray(dots[:, start : start + width]) for start in (0, shift_px // 2, shift_px)
@@ -47,12 +47,12 @@ def by_method(rows, scene):
 
 
 def listed(scenes):
-    """What lists them as if each were read."""
+    """Return a function that lists the scenes as if each were read."""
     return lambda: [partial(lambda scene: scene, scene) for scene in scenes]
 
 
 def constant(disparity_px):
-    """What makes a matcher that finds one disparity everywhere."""
+    """Return the factory of a matcher that finds one disparity everywhere."""
 
     def match(pair):
         map_px = np.full(pair.left.shape[:2], disparity_px, np.float32)
@@ -80,8 +80,8 @@ def test_a_plane_at_its_true_disparity_is_seen_without_error(rng):
 
 
 def test_each_kind_of_pixel_has_its_own_error():
-    # Half way the box stands at columns 16 to 23: its edges take columns 13 to 18 and 21 to 26, and of the
-    # 40 columns 0, 13, 14, 15, 24, 25, 26 and 39 are seen by one photograph (test_view_truth.py).
+    # Halfway, the box is at columns 16 to 23. Its edges take columns 13 to 18 and 21 to 26. Only one
+    # photograph shows columns 0, 13, 14, 15, 24, 25, 26 and 39 of the 40 (test_view_truth.py).
     edges = [*range(13, 19), *range(21, 27)]
     image = np.full((32, 40, 3), 101, np.uint8)
     image[:, edges] = 110
@@ -98,18 +98,18 @@ def test_each_kind_of_pixel_has_its_own_error():
         assert math.isnan(row.neither_mae)
 
 
-def test_what_neither_photograph_sees_counts_by_itself():
+def test_pixels_that_neither_photograph_shows_have_their_own_error():
     image = np.full((32, 40, 3), 100, np.uint8)
     image[:, 12:14], image[:, 14:17] = 110, 106
     scene = scene_of(boxes_before_a_wall((10, 16), (18, 24), height=32), (0.5, image))
     row = by_method(rows_of({}, [scene]), "shed")["ground truth"]
-    # The slit is at columns 12 and 13 (test_view_truth.py), and the boxes' edges towards it are edges too: of
-    # 3 to 22, all that is near an edge, 18 columns are known, and three of these off by 6.
+    # The slit is at columns 12 and 13 (test_view_truth.py), and its borders are depth edges too. Of columns 3
+    # to 22, which are all near an edge, 18 are known, and three of these are off by 6.
     assert (row.neither_mae, row.edge_mae, row.smooth_mae) == (10, 1, 0)
     assert row.neither_psnr_db == pytest.approx(TEN_LEVELS_DB)
 
 
-def test_the_two_yardsticks_show_the_photographs_themselves():
+def test_the_baselines_without_disparity_show_the_photographs_themselves():
     dark, bright = (np.full((32, 40, 3), level, np.uint8) for level in (100, 140))
     sample = make_sample(StereoPair(left=dark, right=bright), np.full((32, 40), np.nan))
     rows = rows_of({}, [scene_of(sample, (0.25, dark), (0.75, dark), (1.5, bright))])
@@ -118,7 +118,7 @@ def test_the_two_yardsticks_show_the_photographs_themselves():
     assert [errors["cross-fade", position] for position in (0.25, 0.75, 1.5)] == [10, 30, 0]
 
 
-def test_without_known_disparity_there_is_no_ceiling_and_there_are_no_kinds():
+def test_without_known_disparity_there_are_no_ground_truth_row_and_no_kinds():
     grey = np.full((32, 40, 3), 100, np.uint8)
     left_alone = make_sample(StereoPair(left=grey, right=grey), np.full((32, 40), 3.0))
     rows = by_method(rows_of({}, [scene_of(left_alone, (0.5, grey))]), "shed")
@@ -139,11 +139,11 @@ def test_a_mean_counts_every_scene_once_however_many_its_positions():
     assert [row.scene for row in rows] == 9 * ["shed"] + 4 * ["barn"] + 4 * ["mean"]
     means = by_method(rows, "mean")
     assert means["sgbm"].mae == (2 + 10) / 2
-    assert means["sgbm"].smooth_mae == means["ground truth"].mae == 10  # of the one scene that has it
+    assert means["sgbm"].smooth_mae == means["ground truth"].mae == 10  # from the one scene that has it
     assert all(math.isnan(row.position) for row in means.values())
 
 
-def test_moving_a_picture_by_a_pixel_takes_each_from_its_neighbour(rng):
+def test_shifting_an_image_by_a_pixel_takes_each_pixel_from_its_neighbour(rng):
     image = rng.integers(0, 256, (8, 9, 3), np.uint8)
     np.testing.assert_array_equal(shift_image(image, (1, 2))[2:, 1:], image[:-2, :-1])
     assert shift_image(image, (0, 0)) is image
@@ -155,7 +155,7 @@ def test_no_scene_at_all_is_an_error():
 
 
 @pytest.mark.testdata
-def test_the_referee_finds_the_same_for_a_photograph_beside_its_place(testdata, tmp_path):
+def test_a_photograph_with_an_offset_scores_as_the_referee_says(testdata, tmp_path):
     (tmp_path / "cones").symlink_to(testdata / "stereo" / "views" / "cones")
     program = [
         sys.executable,
