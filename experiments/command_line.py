@@ -12,12 +12,14 @@ from stereoweave.cli.commands import Commands
 RecipeFile = Annotated[
     Path, typer.Argument(metavar="RECIPE", help="TOML file of the base recipe, in recipes/.")
 ]
-RunsFolder = Annotated[Path, typer.Option("--out", "-o", help="Folder of the trainings.")]
-Seeds = Annotated[int, typer.Option(min=1, help="Repetitions of each training, with different seeds.")]
+RunsFolder = Annotated[Path, typer.Option("--out", "-o", help="Folder of the training runs.")]
+Seeds = Annotated[
+    int, typer.Option(min=1, help="Number of repetitions of each training, with different seeds.")
+]
 
 
 def run(command: Callable[..., None], module: str, arguments: Sequence[str] | None) -> int:
-    """Run an experiment's only command, as `python -m MODULE`. Returns its exit code, as `root.run` does."""
+    """Run an experiment's only command, `python -m MODULE`. Returns its exit code, as `root.run` does."""
     app = Commands()
     app.command()(command)
     return root.run(app, f"python -m {module}", arguments)

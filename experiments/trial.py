@@ -1,4 +1,4 @@
-"""A training of an experiment."""
+"""One training among those of an experiment."""
 
 from dataclasses import dataclass
 
@@ -10,8 +10,8 @@ class Trial:
     """One training of an experiment.
 
     Attributes:
-        claim: The claim or choice that it tests.
-        setting: Its name among the trainings of that claim.
+        claim: Claim or design choice that the training tests.
+        setting: Name of the training among those of the claim.
         recipe: Everything that the training depends on.
     """
 

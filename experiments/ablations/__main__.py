@@ -17,18 +17,19 @@ def ablations(
     report: Annotated[
         Path,
         typer.Option(
-            help="CSV file to write, one row per training. Rows of the same recipe are reused, others are "
-            "dropped: remove the file after a change of the code."
+            help="CSV file to write, with one row per training. Rows of the same recipe are reused, and "
+            "others "
+            "dropped; remove the file after a change of the code."
         ),
     ],
     rendered: Annotated[
-        Path, typer.Option(metavar="FOLDER", help="Held-out pairs from stereoweave synth make.")
+        Path, typer.Option(metavar="FOLDER", help="Set of held-out pairs from stereoweave synth make.")
     ] = Path("runs/synth_val/rooms"),
     seeds: Seeds = 2,
 ) -> None:
-    """Change one design choice of WeaveNet at a time, train it, and score it on collages and rendered pairs.
+    """Train and score WeaveNet with one design choice changed at a time.
 
-    Rerun the same command to resume after an interruption.
+    Held-out collages and rendered pairs are scored. Rerun the same command to resume after an interruption.
     """
     from rich.console import Console
 

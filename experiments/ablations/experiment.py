@@ -1,4 +1,4 @@
-"""Ablations: WeaveNet with one design choice changed at a time, at equal budget."""
+"""Ablations: WeaveNet with one design choice changed at a time, at an equal training budget."""
 
 import csv
 import hashlib
@@ -31,7 +31,7 @@ from stereoweave.learn.training.scores import validate
 
 BASE = "base"
 MIX = ((COLLAGE, 0.55), ("runs/synth/rooms", 0.33), ("runs/synth/scenes", 0.12))
-# For each design choice, its variations and their changes of the base recipe.
+# For each design choice, its variations and their changes to the base recipe.
 VARIATIONS: dict[str, dict[str, dict[str, Any]]] = {
     "what all are compared with": {BASE: {}},
     "correlation resolution": {"eighth": {"model": "weave_small_eighth"}},
@@ -60,7 +60,7 @@ _CPU = torch.device("cpu")
 
 
 def plan(base: Recipe, seeds: int) -> list[Trial]:
-    """Plan all variations with the first seed, then all with the next one. Recipes are named after both."""
+    """Return trials of all variations with the first seed, then the next. Recipes are named after both."""
     return [
         Trial(
             claim=choice,
@@ -109,7 +109,7 @@ def run_ablations(
 
 
 def fingerprint(recipe: Recipe) -> str:
-    """Hash of a recipe without its name, in 8 hexadecimal digits."""
+    """Return the hash of a recipe without its name, in 8 hexadecimal digits."""
     return hashlib.sha256(repr(replace(recipe, name="")).encode()).hexdigest()[:8]
 
 
@@ -143,7 +143,7 @@ def _make_row(trial: Trial, trained: Checkpoint, held_out: dict[str, PairSource]
 
 
 def _measure_near_edges(match: DisparityMethod, pairs: PairSource) -> dict[str, float]:
-    """Mean errors near depth edges, over the pairs that have edges."""
+    """Return mean errors near depth edges, over the pairs that have edges."""
     rows = []
     for index in range(pairs.count):
         sample = pairs[index]

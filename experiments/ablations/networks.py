@@ -1,4 +1,4 @@
-"""Variants of SMALL for the ablations: WeaveNets that differ from it in one thing each."""
+"""Variants of SMALL for the ablations, each a WeaveNet that differs from SMALL in one respect."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -27,37 +27,37 @@ from stereoweave.learn.models.weave import (
 
 
 def upsample_bilinear(x: Float[Tensor, "b 1 h w"], weights: Tensor) -> Float[Tensor, "b 1 h2 w2"]:
-    """Enlarge to twice the size. Ignores the weights, which `upsample` takes in other networks."""
+    """Enlarge maps to twice their size. Ignores the weights, which `upsample` uses in other networks."""
     return F.interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=False)
 
 
 def soft_argmax(logits: Float[Tensor, "b d h w"]) -> Float[Tensor, "b 1 h w"]:
-    """Expected level under a softmax over all levels (Kendall et al. 2017); a mixture at edges."""
+    """Return the expected level under a softmax over all levels (Kendall et al. 2017); a mixture at edges."""
     levels = torch.arange(logits.shape[1], device=logits.device).view(1, -1, 1, 1)
     return (logits.softmax(1) * levels).sum(1, keepdim=True)
 
 
 class BilinearWeaveNet(WeaveNet):
-    """Bilinear upsampling, without weights from the image."""
+    """WeaveNet with bilinear upsampling, without weights from the image."""
 
     upsample = staticmethod(upsample_bilinear)
 
     def __init__(self) -> None:
         super().__init__()
-        # The weights would be computed and never read.
+        # The weights would be computed but never used.
         self.register_module("weights", nn.Identity())
         self.refinement.register_module("weights", nn.Identity())
 
 
 class AllLevelsWeaveNet(WeaveNet):
-    """Disparity as the expectation over all levels instead of those around the best one."""
+    """WeaveNet whose disparity is the expectation over all levels, not only over those around the best."""
 
     def read_disparity(self, scores: Tensor, decoded: Tensor) -> Tensor:
         return soft_argmax(scores)
 
 
 class GroupedWeaveNet(WeaveNet):
-    """Group-wise correlation (GwcNet, Guo et al. 2019): scores for each of `groups` groups of channels."""
+    """WeaveNet with group-wise correlation (GwcNet, Guo et al. 2019), which scores groups of channels."""
 
     def __init__(self, groups: int = 4) -> None:
         super().__init__()
@@ -74,13 +74,13 @@ class GroupedWeaveNet(WeaveNet):
             for group in match.chunk(self.groups, 1)
         ]
         correlation = torch.stack(volumes).sum(0)
-        # The last group is redundant beside the sum of all.
+        # The last group follows from the others and the sum of all.
         beside = first._replace(quarter=torch.cat([first.quarter, *volumes[:-1]], 1))
         return correlation, *self.aggregation(correlation, beside)
 
 
 class EighthAggregation(Aggregation):
-    """Aggregation of scores at 1/8; the decoder still ends at 1/4."""
+    """Aggregation of scores at 1/8 of the resolution, with a decoder that still ends at 1/4."""
 
     def __init__(self, levels: int) -> None:
         super().__init__(levels, SMALL)
@@ -98,7 +98,7 @@ class EighthAggregation(Aggregation):
 
 
 class EighthWeaveNet(WeaveNet):
-    """Correlation at 1/8, with half as many levels of 8 px."""
+    """WeaveNet with correlation at 1/8 of the resolution, over half as many levels of 8 px each."""
 
     def __init__(self) -> None:
         super().__init__(SMALL, levels=24)
@@ -126,7 +126,7 @@ class NoContext(nn.Module):
 
 
 class WeaveNetWithoutContext(WeaveNet):
-    """Aggregation without its context at 1/16."""
+    """WeaveNet whose aggregation lacks the context at 1/16 of the resolution."""
 
     def __init__(self) -> None:
         super().__init__()

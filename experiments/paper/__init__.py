@@ -1,1 +1,1 @@
-"""The paper's experiment."""
+"""Experiment on the claims of "Fast Depth Estimation for View Synthesis"."""

@@ -15,14 +15,14 @@ from stereoweave.cli.options import require_train_extra
 def paper(  # noqa: PLR0913 - each is an option of the command line
     recipe: RecipeFile,
     out: RunsFolder,
-    report: Annotated[Path, typer.Option(help="Folder for rows, tables and figures.")],
+    report: Annotated[Path, typer.Option(help="Folder to write rows, tables and figures to.")],
     seeds: Seeds = 3,
-    jobs: Annotated[int, typer.Option(min=1, help="Trainings that run at the same time.")] = 1,
+    jobs: Annotated[int, typer.Option(min=1, help="Number of trainings that run in parallel.")] = 1,
     exponent_only: Annotated[
-        bool, typer.Option("--exponent-only", help="Run the depth adjustment (Fig. 2) only.")
+        bool, typer.Option("--exponent-only", help="Run only the depth adjustment (Fig. 2).")
     ] = False,
 ) -> None:
-    """Train the paper's network, its rivals and every variant, and compare them with the paper's tables.
+    """Train the paper's network, its rivals and all variants, and compare them with the paper's tables.
 
     Rerun the same command to resume after an interruption.
     """

@@ -15,12 +15,12 @@ class PaperRow:
 
     Attributes:
         claim, setting: Purpose of the training. A training that serves several claims has a row for each.
-        seed: Seed of the first weights, the training pairs and their order.
+        seed: Seed of the initial weights, the training pairs and their order.
         steps: Steps of the training; it has seen steps * batch pairs.
         prediction: Loss between codes that the network was trained with.
         squared_error: Squared error between codes without exponent, which is comparable between exponents.
         epe_px, epe_cm, mae_sourced, sourced_percent, mae_filled, psnr_db, ssim: See `ViewRow`.
-        minutes: Wall time of the training and of the one it started from; trainings may share the machine.
+        minutes: Wall time of the training and of the one that it started from; trainings may run in parallel.
     """
 
     claim: str
@@ -52,7 +52,7 @@ class Comparison:
 
     Attributes:
         paper: The paper's words or numbers.
-        paper_percent: These as one number; None if the paper gives none.
+        paper_percent: The paper's claim as one number; None if the paper gives none.
     """
 
     text: str
@@ -76,7 +76,7 @@ TABLE_I = {
     "psmnet": ((3.85, 8.12, 3.88, 2.38), (7.94, 10.32, 7.36, 41.22)),
     "fast_depth": ((3.95, 6.42, 4.08, 2.32), (7.99, 8.24, 7.93, 37.31)),
 }
-# The only column with depth as its target.
+# Index of the only column whose target is depth.
 _PROPELLER = 3
 _COLUMNS = {
     "epe_cm": ("EPE cm", ".1f"),
@@ -156,12 +156,12 @@ def _table_i_measure(rival: str, column: int, measure: str, name: str, depth: bo
 
 
 def reduction_percent(reference: float, changed: float) -> float:
-    """Reduction from `reference` to `changed`, in percent."""
+    """Return the reduction from `reference` to `changed`, in percent."""
     return 100 * (1 - changed / reference)
 
 
 def reductions_by_seed(rows: Sequence[PaperRow], comparison: Comparison) -> list[float]:
-    """Reductions in percent, one for each seed that both settings were trained with."""
+    """Return the reductions in percent, one for each seed that both settings were trained with."""
     reference, changed = (
         {row.seed: getattr(row, comparison.measure) for row in _select(rows, comparison.claim, setting)}
         for setting in (comparison.reference, comparison.changed)
@@ -171,14 +171,14 @@ def reductions_by_seed(rows: Sequence[PaperRow], comparison: Comparison) -> list
 
 
 def interval_half_width(values: Sequence[float]) -> float:
-    """Half the width of the mean's 95 % interval, by Student's t over the seeds; NaN for fewer than two."""
+    """Return half the width of the mean's 95 % interval, by Student's t; NaN for fewer than two values."""
     if len(values) < 2:
         return float("nan")
     return float(stats.t.ppf(0.975, len(values) - 1) * np.std(values, ddof=1) / np.sqrt(len(values)))
 
 
 def claims_table(rows: Sequence[PaperRow], depth: bool = False) -> str:
-    """Markdown table of the claims: the paper's number, ours, the difference and a verdict.
+    """Return a Markdown table of the claims: the paper's number, ours, the difference and a verdict.
 
     With `depth` as the target, end-point errors are in cm, and Table I is compared by its Propeller column.
     """
@@ -201,7 +201,7 @@ def claims_table(rows: Sequence[PaperRow], depth: bool = False) -> str:
 
 
 def propeller_table(rows: Sequence[PaperRow]) -> str:
-    """Markdown table of the networks on our own propeller pairs, beside Table I's Propeller column."""
+    """Return a Markdown table of the networks on our propeller pairs, beside Table I's Propeller column."""
     columns = "network", "steps", "EPE cm: paper", "here", "difference", "MAE of the right view: paper"
     lines = [f"| {' | '.join((*columns, 'here', 'difference'))} |", "|---" * 8 + "|"]
     found = [row for row in rows if row.claim in (NETWORKS, NETWORKS_SHORT)]
@@ -216,7 +216,7 @@ def propeller_table(rows: Sequence[PaperRow]) -> str:
 
 
 def settings_table(rows: Sequence[PaperRow], claim: str, depth: bool = False) -> str:
-    """Markdown table of a claim's settings, as means over their seeds, by ascending filled MAE.
+    """Return a Markdown table of a claim's settings, as means over their seeds, by ascending filled MAE.
 
     Settings with one seed come last, because a single score does not compare with a mean. With `depth` as the
     target, end-point errors are given in cm too.
@@ -237,7 +237,7 @@ def settings_table(rows: Sequence[PaperRow], claim: str, depth: bool = False) ->
 
 
 def run_time_table(rows: Iterable[Mapping[str, str]]) -> str:
-    """Markdown table of run times, with the paper's as multiples of DenseMapNet's.
+    """Return a Markdown table of run times, beside the paper's, as multiples of DenseMapNet's.
 
     Args:
         rows: Rows of the CSV file that `python -m experiments.speed` writes. The paper's column is empty
@@ -286,7 +286,7 @@ def _judge(comparison: Comparison, mean: float, half: float) -> str:
 
 
 def _table_i_order(trained: tuple[str, int]) -> tuple[int, int]:
-    """Sort key: the order of Table I's rows, then the number of steps."""
+    """Return a sort key: the order of Table I's rows, then the number of steps."""
     return list(TABLE_I).index(trained[0]), trained[1]
 
 

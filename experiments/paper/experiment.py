@@ -1,4 +1,4 @@
-"""Run the paper's experiment: every training of trials.py, on the same pairs in the same order."""
+"""Run of the paper's experiment: every training of trials.py, on the same pairs in the same order."""
 
 import multiprocessing
 import os
@@ -50,9 +50,9 @@ def run_trials(planned: Iterable[Trial], runs: Path, jobs: int, console: Console
     """Train each trial in its own folder of `runs`. Interrupted trainings resume.
 
     Args:
-        planned: Trials, all of whose training pairs exist, so that no two trainings create the same ones.
+        planned: Trials whose training pairs all exist, so that no two trainings create the same ones.
         runs: Folder of the runs.
-        jobs: Trainings that run at the same time and share the processor's cores.
+        jobs: Number of trainings that run in parallel and share the processor's cores.
         console: Shows the progress.
     """
     recipes = {trial.recipe.name: trial.recipe for trial in planned}.values()
@@ -62,7 +62,7 @@ def run_trials(planned: Iterable[Trial], runs: Path, jobs: int, console: Console
 
 
 def _check_base(base: Recipe) -> None:
-    # A collage has no camera.
+    # Collages have no camera, which depth as a target would need.
     target = {"target": "disparity"} if base.dataset == COLLAGE else {}
     for key, expected in {"model": "fast_depth", **target}.items():
         if (found := getattr(base, key)) != expected:
@@ -71,8 +71,8 @@ def _check_base(base: Recipe) -> None:
             )
     if base.steps < SHORT:
         raise StereoweaveError(
-            f"{base.name}: steps = {base.steps}, expected at least {SHORT}: "
-            "some trainings have a quarter of them"
+            f"{base.name}: steps = {base.steps}, expected at least {SHORT}, "
+            "because some trainings take a quarter of them"
         )
 
 

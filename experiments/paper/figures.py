@@ -1,7 +1,7 @@
 """Figures of "Fast Depth Estimation for View Synthesis", drawn from our own runs.
 
-The extension of a path sets the format. Use .jpg for figures of photographs, which as PNG are ten
-times larger.
+The extension of a path selects the format. Use .jpg for figures with photographs, which would be ten times
+larger as PNG.
 """
 
 from collections.abc import Mapping, Sequence
@@ -32,7 +32,7 @@ _TITLE_HEIGHT_IN = 0.3
 def draw_exponent_curves(
     path: str | Path, exponents: Sequence[float], histogram: Real[np.ndarray, " n"] | None = None
 ) -> None:
-    """Write Fig. 2, left: the code against normalised depth, one curve per exponent.
+    """Write the left plot of Fig. 2: the code against normalised depth, one curve per exponent.
 
     Args:
         path: Picture to write.
@@ -54,11 +54,11 @@ def draw_exponent_curves(
 
 
 def draw_validation(path: str | Path, curves: Mapping[str, Sequence[Sequence[tuple[int, float]]]]) -> None:
-    """Write Fig. 2, right: error on held-out pairs against steps; thin lines are seeds, bold lines means.
+    """Write the right plot of Fig. 2: held-out error against steps; thin lines are seeds, bold lines means.
 
     Args:
         path: Picture to write.
-        curves: For each setting, one list of (step, squared error of the straight code) per seed. Means are
+        curves: For each setting, one list of (step, squared error of the linear code) per seed. Means are
             drawn at the steps that all seeds have.
     """
     figure, axes = _plot()
@@ -66,7 +66,7 @@ def draw_validation(path: str | Path, curves: Mapping[str, Sequence[Sequence[tup
         for seed in seeds:
             axes.plot(*zip(*seed, strict=True), color=colour, linewidth=0.8, alpha=0.4)
         axes.plot(*_mean_curve(seeds), color=colour, linewidth=2.5, label=setting)
-    axes.set(yscale="log", xlabel="training step", ylabel="validation: squared error of the straight code")
+    axes.set(yscale="log", xlabel="training step", ylabel="validation: squared error of the linear code")
     # Matplotlib would label whole decades only, and a loss may cross none.
     axes.yaxis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 5, 7)))
     axes.yaxis.set_major_formatter(FormatStrFormatter("%g"))
@@ -108,7 +108,7 @@ def draw_views(path: str | Path, rows: Sequence[Estimated]) -> None:
 
 
 def _mean_curve(seeds: Sequence[Sequence[tuple[int, float]]]) -> tuple[list[int], list[float]]:
-    """Steps that all seeds have, and their mean losses."""
+    """Return the steps that all seeds have, and the mean losses at them."""
     losses = [dict(seed) for seed in seeds]
     steps = sorted(set.intersection(*(set(loss) for loss in losses)))
     return steps, [float(np.mean([loss[step] for loss in losses])) for step in steps]

@@ -41,7 +41,7 @@ from stereoweave.learn.recipe import COLLAGE, Recipe
 from stereoweave.learn.training.loop import SCORES_FILE, read_scores
 from stereoweave.learn.training.objective import count_truth
 
-# Held-out pairs that the figures show, modulo their number.
+# Indices of the held-out pairs that the figures show, modulo the number of pairs.
 SHOWN = (3, 11, 24)
 # Optional input in the report's folder, from `python -m experiments.speed`.
 SPEED = "speed.csv"
@@ -60,7 +60,7 @@ class Report:
         kept: Checkpoints of the trained trials, by name of the recipe.
         curves: Scores of the trained trials by step, by name of the recipe.
         rows: One row per trained trial.
-        common: Scores of methods without training, on the base's held-out pairs.
+        common: Scores of untrained methods on the base's held-out pairs.
     """
 
     base: Recipe
@@ -90,7 +90,7 @@ def write_report(base: Recipe, planned: Sequence[Trial], runs: Path, out: Path) 
         out: Folder to write to. If it contains speed.csv, paper.md includes these run times.
 
     Raises:
-        StereoweaveError: If no trial is trained to its end.
+        StereoweaveError: If no trial is finished.
         FormatError: If speed.csv is damaged.
     """
     run_time = _read_run_times(out / SPEED)
@@ -108,7 +108,7 @@ def _gather(base: Recipe, planned: Sequence[Trial], runs: Path) -> Report:
     trained = [trial for trial in planned if _is_finished(trial, kept)]
     if not trained:
         raise StereoweaveError(
-            f"{runs}: expected a trial trained to its end, found none of {len(files)}; "
+            f"{runs}: expected at least one finished trial, found none of {len(files)}; "
             "run `python -m experiments.paper`"
         )
     scores, common = _score([base, *(trial.recipe for trial in trained)], runs)
@@ -134,13 +134,13 @@ def _is_finished(trial: Trial, kept: Mapping[str, Checkpoint]) -> bool:
 
 
 def _score(recipes: Sequence[Recipe], runs: Path) -> tuple[dict[str, ProjectionRow], list[ProjectionRow]]:
-    """Scores of all runs but the first recipe's, and of methods without training on the first one's pairs."""
+    """Return scores of all runs but the first recipe's, and of untrained methods on that recipe's pairs."""
     base, *others = recipes
     scores: dict[str, ProjectionRow] = {}
     common: list[ProjectionRow] = []
     for pairs in dict.fromkeys(identify_held_out(recipe) for recipe in others):
         names = list(dict.fromkeys(recipe.name for recipe in others if identify_held_out(recipe) == pairs))
-        # Quiet: all pairs exist since the plan was made.
+        # Quiet, because all pairs were created with the plan.
         found = evaluate([runs / name for name in names], runs / "pairs", Console(quiet=True))
         scores |= {row.method: row for row in found if row.method in names}
         if pairs == identify_held_out(base):
@@ -176,7 +176,7 @@ def _make_row(trial: Trial, kept: Checkpoint, score: ProjectionRow) -> PaperRow:
 
 
 def _format_report(report: Report, run_time: str) -> str:
-    """The whole report: setup, tables, and trials that were not run."""
+    """Return the whole report: setup, tables, and trials that were not run."""
     parts = [
         "# The paper's experiment: results",
         *_describe_setup(report),
@@ -200,7 +200,7 @@ def _format_report(report: Report, run_time: str) -> str:
 
 
 def _describe_setup(report: Report) -> list[str]:
-    """Settings that all trainings share, deviations from the paper, and how to read the tables."""
+    """Describe the settings of all trainings, deviations from the paper, and how to read the tables."""
     base = report.base
     transfer_seed = f" (the transfer: seed {OTHER_SEED})" if base.dataset == COLLAGE else ""
     unknown = (
@@ -227,7 +227,7 @@ def _describe_setup(report: Report) -> list[str]:
 
 
 def _describe_pairs(report: Report) -> str:
-    """The training pairs, in words."""
+    """Describe the training pairs."""
     base = report.base
     size = f"{base.crop_size[1]}x{base.crop_size[0]}"
     if base.dataset == COLLAGE:
@@ -240,7 +240,7 @@ def _describe_pairs(report: Report) -> str:
 
 
 def _describe_fit(planned: Sequence[Trial]) -> str:
-    """The fitted exponent in words, and the planned exponent that it equals, if any."""
+    """Describe the fitted exponent, and name the planned exponent that it equals, if any."""
     settings = {trial.setting: trial.recipe for trial in reversed(planned) if trial.claim == ADJUSTMENT}
     for setting, recipe in settings.items():
         if setting.endswith(FITTED):
@@ -254,7 +254,7 @@ def _describe_fit(planned: Sequence[Trial]) -> str:
 
 
 def _read_run_times(path: Path) -> str:
-    """Markdown table of the run times in a file; empty if there is no file."""
+    """Return a Markdown table of the run times in a file; empty if there is no file."""
     if not path.exists():
         return ""
     try:
@@ -281,7 +281,7 @@ def _format_common_table(rows: Sequence[ProjectionRow], depth: bool) -> str:
 
 
 def _describe_transfer(report: Report) -> str:
-    """Steps after which the tuned network reaches the best loss of the one from scratch, in words."""
+    """Describe after how many steps the tuned network reaches the best loss of the one from scratch."""
     curves = {
         trial.setting: report.curves[trial.recipe.name] for trial in report.trained if trial.claim == TRANSFER
     }
@@ -328,7 +328,7 @@ def _load_first_seeds(report: Report, claim: str) -> dict[str, DisparityMethod]:
 
 
 def _curves_by_setting(report: Report, claim: str) -> dict[str, list[list[tuple[int, float]]]]:
-    """Lists of (step, squared error) for each setting, one per seed; a training counts once."""
+    """Return lists of (step, squared error) for each setting, one per seed; a training counts once."""
     # Reversed, so that the first trial of a name is kept.
     once = {trial.recipe.name: trial for trial in reversed(report.trained) if trial.claim == claim}
     found: dict[str, list[list[tuple[int, float]]]] = {}

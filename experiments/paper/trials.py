@@ -1,4 +1,4 @@
-"""Trainings of the paper's experiment: for each claim, recipes that differ in one thing only."""
+"""Trainings of the paper's experiment: for each claim, recipes that differ in one respect only."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -29,7 +29,7 @@ RIVAL_SETTINGS: dict[str, dict[str, Any]] = {
 # PSMNet takes 59 times the multiply-adds of the paper's network, so the two are compared after fewer steps.
 SHORT = 4
 FIGURE_3_STEPS = (10, 50, 250)
-# The set of the transfer: fewer and larger collages with larger disparities.
+# The target set of the transfer: fewer and larger collages with larger disparities.
 OTHER_SEED = 100
 OTHER_PAIRS = 500
 OTHER_SIZE = 1.5
@@ -47,7 +47,7 @@ def list_trials(base: Recipe, seeds: int, fitted_exponent: float) -> list[Trial]
             run once.
         fitted_exponent: The exponent p fitted to the histogram of the base's training truth.
     """
-    # Otherwise training would replace every p by the fitted one.
+    # Otherwise every training would replace its exponent p by the fitted one.
     base = replace(base, fit_exponent=False)
     rivals = {rival: _rival_changes(rival) for rival in RIVAL_SETTINGS}
     every = {"psmnet": rivals["psmnet"], "fast_depth": {}, **rivals}
@@ -93,12 +93,12 @@ def _rival_changes(model: str) -> dict[str, Any]:
 
 
 def _other_losses(base: Recipe) -> tuple[str, ...]:
-    """Losses that the paper compares with l2; the perceptual loss needs a file that cannot be shipped."""
+    """Return the losses that the paper compares with l2; perceptual needs a file that cannot be shipped."""
     return ("l1", "smooth_l1", "cross_entropy", *(("perceptual",) if base.vgg16_weights else ()))
 
 
 def _with_name(recipe: Recipe) -> Recipe:
-    """The recipe with a name that spells out everything in which trials differ."""
+    """Return the recipe with a name that spells out everything in which trials differ."""
     parts = [
         recipe.model,
         recipe.loss,

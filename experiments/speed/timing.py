@@ -1,4 +1,4 @@
-"""Run times of the paper's network and its rivals in one run, relative to DenseMapNet."""
+"""Run times of the paper's network and its rivals, measured together, relative to DenseMapNet's."""
 
 import tempfile
 import time
@@ -44,12 +44,12 @@ class SpeedRow:
 def measure_run_times(
     recipe: Recipe, networks: Sequence[str] = NETWORKS, turns: int = TURNS
 ) -> list[SpeedRow]:
-    """Time networks in turns, so that a slower phase of the machine affects all alike. Returns a row each.
+    """Return a row per network, timed in turns so that a slower phase of the machine affects all alike.
 
     Args:
-        recipe: Builds the networks, with its target and range replaced by disparity up to 192 px.
+        recipe: Recipe that builds the networks; its target and range become disparity up to 192 px.
         networks: Names in MODELS, including DenseMapNet's.
-        turns: Repetitions. PSMNet, by far the slowest, is timed a third as often.
+        turns: Number of repetitions; PSMNet, by far the slowest, is timed a third as often.
     """
     torch.set_num_threads(thread_count(None))
     pair = torch.rand(2, 1, 3, HEIGHT_PX, WIDTH_PX)
@@ -98,7 +98,7 @@ def _make_onnx_call(network: DisparityNetwork, pair: torch.Tensor, file: Path) -
 
 
 def _measure_ms(calls: Mapping[str, tuple[Callable[[], object], ...]], turns: int) -> dict[str, list[float]]:
-    """Median time of each call in milliseconds, by network."""
+    """Return the median time of each call in milliseconds, by network."""
     taken: dict[str, list[list[float]]] = {name: [[] for _ in both] for name, both in calls.items()}
     for turn in range(-1, turns):  # the first turn warms up
         for name, both in calls.items():

@@ -12,12 +12,13 @@ from stereoweave.cli.options import make_parent_folder, require_train_extra
 
 
 def stage_costs(
-    runs: Annotated[list[Path], typer.Argument(help="Checkpoints, or folders of stereoweave train.")],
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="CSV file to write as well.")] = None,
+    runs: Annotated[list[Path], typer.Argument(help="Checkpoints, or run folders of stereoweave train.")],
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="CSV file to write in addition.")] = None,
 ) -> None:
-    """Measure each stage of trained WeaveNets: multiply-adds, bytes moved, time; print a Markdown table.
+    """Measure the stages of trained WeaveNets, and print a Markdown table.
 
-    The "of the peak" columns compare a stage's speed with that of a large matrix product in the same run.
+    Columns are multiply-adds, bytes moved and times. The columns "of the peak" give a stage's speed relative
+    to a large matrix product in the same run.
     """
     from stereoweave.bench.tables import write_csv
 

@@ -1,4 +1,4 @@
-"""Costs of WeaveNet's stages under ONNX Runtime: multiply-adds, bytes moved, time on the CPU."""
+"""Costs of WeaveNet's stages under ONNX Runtime: multiply-adds, bytes moved and time on the CPU."""
 
 import ast
 import json
@@ -27,15 +27,15 @@ TURNS = 15
 PRODUCT = f"product of two {PRODUCT_SIDE}x{PRODUCT_SIDE} matrices"
 TOTAL = "total"
 
-# Stages of modules that have another name than their stage.
+# Stages of modules whose name differs from that of their stage.
 _STAGES = {
     "to_match": "correlation",
     "weights": "upsampling",
     "to_match_half": "matching at 1/2",
     "to_half": "refinement",
 }
-# Stages of operations between a module's parts, by that module ("" for the network itself) and by the part of
-# the network that ran last.
+# Stages of operations between the parts of a module, by that module ("" for the network itself) and by the
+# part of the network that ran last.
 _STAGES_BETWEEN = {
     ("", ""): "encoder",
     ("", "encoder"): "mirroring",
@@ -46,7 +46,7 @@ _STAGES_BETWEEN = {
     ("", "refinement"): "upsampling",
     ("refinement", "to_half"): "matching at 1/2",
 }
-# Kernels that change shapes only, and move no data.
+# Kernels that only change shapes, and move no data.
 _VIEWS = {"Reshape", "Squeeze", "Unsqueeze", "Flatten", "Identity"}
 
 
@@ -58,8 +58,8 @@ class StageCost:
         network: Name of the recipe; "" for PRODUCT.
         stage: Name of the stage; TOTAL for all stages; PRODUCT for the matrix product that measures the peak.
         multiply_adds: Multiply-adds of convolutions, matrix products and sums of products.
-        moved_mb: 10^6 bytes that the kernels read and write, weights included; caches save much of it.
-        one_thread_ms, two_threads_ms: Minimum over the turns, since other work only adds time.
+        moved_mb: 10^6 bytes that kernels read and write, weights included; much of it stays in caches.
+        one_thread_ms, two_threads_ms: Minimum over the turns, because other work only adds time.
         one_thread_peak_percent, two_threads_peak_percent: Multiply-adds per second, relative to PRODUCT's.
     """
 
@@ -121,7 +121,7 @@ def measure_stage_costs(runs: Sequence[Path], turns: int = TURNS) -> list[StageC
 
 
 def format_table(rows: Sequence[StageCost]) -> str:
-    """The rows as a Markdown table."""
+    """Return the rows as a Markdown table."""
     lines = [
         "| network | stage | million multiply-adds | MB moved | ms, one thread | of the peak "
         "| ms, two threads | of the peak |",
@@ -137,12 +137,12 @@ def format_table(rows: Sequence[StageCost]) -> str:
 
 
 def trace(network: WeaveNet) -> onnx.ModelProto:
-    """Graph of the network as `export_fixed_graph` makes it, with the module of each node noted."""
+    """Return the network's graph as `export_fixed_graph` makes it, with the module of each node noted."""
     return export_annotated_graph(network, HEIGHT_PX, WIDTH_PX, None)
 
 
 def find_stages(graph: onnx.ModelProto) -> dict[str, str]:
-    """Stage of each node and of each of its outputs, by name, in the order of execution."""
+    """Return the stage of each node and of each node's outputs, by name, in the order of execution."""
     stages: dict[str, str] = {}
     last = ""
     for node in graph.graph.node:
@@ -161,7 +161,7 @@ def find_stages(graph: onnx.ModelProto) -> dict[str, str]:
 
 
 def count_multiply_adds(graph: onnx.ModelProto) -> Counter[str]:
-    """Multiply-adds by node: convolutions, matrix products, and elementwise products that are only summed."""
+    """Return multiply-adds by node: convolutions, matrix products, and products that are only summed."""
     inferred = onnx.shape_inference.infer_shapes(graph).graph
     shapes = {tensor.name: list(tensor.dims) for tensor in inferred.initializer}
     for value in (*inferred.input, *inferred.value_info, *inferred.output):
@@ -188,7 +188,7 @@ def measure(graph: onnx.ModelProto, stages: Mapping[str, str], turns: int) -> di
     Args:
         graph: Graph with inputs of one fixed size.
         stages: Result of `find_stages`; if empty, only TOTAL is measured.
-        turns: Repetitions, after one to warm up.
+        turns: Repetitions, after one for warm-up.
     """
     profiles = [profile(graph, threads, turns) for threads in (1, 2)]
     of_kernels = [_assign_kernels(each.optimised, stages) for each in profiles]
@@ -213,11 +213,11 @@ def measure(graph: onnx.ModelProto, stages: Mapping[str, str], turns: int) -> di
 
 
 def profile(graph: onnx.ModelProto, threads: int, turns: int) -> Profile:
-    """Profile a graph on random float32 inputs, for `turns` turns after one to warm up."""
+    """Profile a graph on random float32 inputs, for `turns` turns after one for warm-up."""
     with tempfile.TemporaryDirectory() as folder:
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads
-        options.log_severity_level = 4  # no warning that the optimised graph suits this machine only
+        options.log_severity_level = 4  # hides a warning that the optimised graph suits only this machine
         options.optimized_model_filepath = str(Path(folder, "optimised.onnx"))
         options.enable_profiling = True
         options.profile_file_prefix = str(Path(folder, "profile"))
@@ -245,7 +245,7 @@ def _parse_profile(optimised: onnx.ModelProto, events: list[dict[str, Any]]) -> 
 
 
 def _assign_kernels(optimised: onnx.ModelProto, stages: Mapping[str, str]) -> dict[str, str]:
-    """Stage of each kernel, by the kernel's name."""
+    """Return the stage of each kernel, by the kernel's name."""
     known, found = dict(stages), {}
     for node in optimised.graph.node:
         # A kernel fused from several nodes is named after its output. A kernel that ONNX Runtime adds to
@@ -257,13 +257,13 @@ def _assign_kernels(optimised: onnx.ModelProto, stages: Mapping[str, str]) -> di
 
 
 def _min_ms(profiled: Profile, stages: Mapping[str, str], stage: str) -> float:
-    """Minimum over the turns of a stage's time."""
+    """Return the minimum of a stage's time over the turns."""
     kernels = [times for name, times in profiled.kernels_ms.items() if stages[name] == stage]
     return min(map(sum, zip(*kernels, strict=True)), default=0.0)
 
 
 def _load_weave_net(run: Path) -> tuple[str, WeaveNet]:
-    """Name of a checkpoint's recipe, and its averaged network."""
+    """Return the name of a checkpoint's recipe, and its averaged network."""
     kept = checkpoint.load(run / "last.pt" if run.is_dir() else run)
     network = load_matcher_network(kept)
     if not isinstance(network, WeaveNet):
@@ -275,13 +275,13 @@ def _load_weave_net(run: Path) -> tuple[str, WeaveNet]:
 
 
 def _make_matrix_product(side: int) -> onnx.ModelProto:
-    """Graph of the product of two square float32 matrices."""
+    """Return the graph of the product of two square float32 matrices."""
     first, second, result = (
         helper.make_tensor_value_info(name, TensorProto.FLOAT, [side, side])
         for name in ("first", "second", "result")
     )
     node = helper.make_node("MatMul", ["first", "second"], ["result"], "product")
-    # The exporter's versions; the onnx package's own may be too new for ONNX Runtime.
+    # The exporter's versions, because the onnx package's own may be too new for ONNX Runtime.
     return helper.make_model(
         helper.make_graph([node], "product", [first, second], [result]),
         opset_imports=[helper.make_opsetid("", 20)],
