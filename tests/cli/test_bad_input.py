@@ -1,4 +1,4 @@
-"""The shipped network on pairs that it cannot match: finite maps, and a confidence that says so."""
+"""The shipped network on pairs that it cannot match: its maps are finite, and its confidence is low."""
 
 from pathlib import Path
 
@@ -62,13 +62,13 @@ def test_pictures_of_two_scenes_are_not_trusted():
 
 
 @pytest.mark.parametrize("shift_px", [200, 230, 260])
-def test_what_is_nearer_than_the_range_is_not_trusted(shift_px):
+def test_surfaces_nearer_than_the_range_are_not_trusted(shift_px):
     wide = paint_collage(UNSEEN_SEED, 3, 0, 256, 900).left
     found = estimate(wide[:, :640], wide[:, shift_px : shift_px + 640])
     assert found.confidence.mean() < 0.25
 
 
-def test_what_lies_behind_the_range_is_not_trusted():
+def test_surfaces_behind_the_range_are_not_trusted():
     wide = paint_collage(UNSEEN_SEED, 3, 0, 256, 700).left
     found = estimate(wide[:, 40:680], wide[:, :640])
     assert found.confidence.mean() < 0.2

@@ -34,7 +34,7 @@ def pair(number):
 
 @pytest.fixture
 def sets(tmp_path):
-    """Two rendered sets below one folder, of two pairs and of one."""
+    """Write two rendered sets below one folder, with two pairs and with one."""
     write_shard(tmp_path / "sets" / "ship", "ship", 0, [pack(pair(0), {}), pack(pair(1), {})])
     write_shard(tmp_path / "sets" / "crane", "crane", 0, [pack(pair(2), {})])
     return tmp_path / "sets"
@@ -50,7 +50,7 @@ def test_all_pairs_of_rendered_sets_are_scenes(sets):
     assert scenes[2].pair.camera == made.camera
 
 
-def test_the_frames_of_a_dataset_that_is_named_are_scenes(tmp_path):
+def test_the_frames_of_a_named_dataset_are_scenes(tmp_path):
     made = pair(3)
     write_frame(tmp_path, "0001", made)
     (scene,) = read_scenes(tmp_path, "paper")
@@ -59,7 +59,7 @@ def test_the_frames_of_a_dataset_that_is_named_are_scenes(tmp_path):
         read_scenes(tmp_path, "words")
 
 
-def test_every_matcher_has_every_number_and_both_plots_are_drawn(sets, tmp_path, capfd, monkeypatch):
+def test_every_matcher_has_every_number_and_both_plots_are_written(sets, tmp_path, capfd, monkeypatch):
     monkeypatch.setenv("COLUMNS", "100")
     out = tmp_path / "out"
     options = f"-o {out}/rows.csv --plot {out}/time.png --sparsification {out}/curves.png --threads 1"
@@ -90,7 +90,7 @@ def test_every_matcher_has_every_number_and_both_plots_are_drawn(sets, tmp_path,
         ("--cluster 127.0.0.1:1", ["127.0.0.1:1: expected the head of a Ray cluster"]),
     ],
 )
-def test_a_mistake_is_told_in_one_line_before_anything_is_measured(
+def test_a_mistake_is_reported_in_one_line_before_anything_is_measured(
     sets, tmp_path, monkeypatch, capfd, options, fragments
 ):
     monkeypatch.chdir(tmp_path)
@@ -134,7 +134,7 @@ def test_errors_by_class_are_a_second_file_and_add_up_to_the_first(sets, tmp_pat
     assert "…" not in printed
 
 
-def test_rendered_pairs_know_their_occlusion_and_folders_do_not(sets, tmp_path):
+def test_rendered_pairs_have_an_occlusion_mask_and_folders_do_not(sets, tmp_path):
     for number, scene in enumerate(read_scenes(sets / "ship")):
         np.testing.assert_array_equal(scene.occluded, pair(number).occluded)
     made = pair(0)
@@ -147,7 +147,7 @@ def test_rendered_pairs_know_their_occlusion_and_folders_do_not(sets, tmp_path):
     assert scene.occluded is None
 
 
-def test_held_out_collages_are_a_set_and_those_that_trainings_validate_on(tmp_path, capfd):
+def test_held_out_collages_are_a_set_of_the_pairs_that_trainings_validate_on(tmp_path, capfd):
     assert main(f"bench collages -o {tmp_path}/collages --pairs 2 --size 64x48".split()) == 0
     assert capfd.readouterr().out == f"{tmp_path}/collages: 2 pairs made\n"
     for number, scene in enumerate(read_scenes(tmp_path / "collages")):
@@ -174,7 +174,7 @@ def test_collages_are_not_written_among_other_files_or_tiny(sets, capfd, options
     assert sorted(sets.rglob("*")) == before
 
 
-def test_collages_are_not_written_where_another_command_writes_them(tmp_path, capfd):
+def test_collages_are_not_written_where_another_command_is_writing(tmp_path, capfd):
     with lock_output(tmp_path):
         assert main(f"bench collages -o {tmp_path} --pairs 2 --size 64x48".split()) == 2
     assert "found one that is in use" in capfd.readouterr().err

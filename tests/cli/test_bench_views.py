@@ -20,7 +20,7 @@ COLUMNS = (
 
 @pytest.fixture
 def sets(tmp_path):
-    """Two rendered sets below one folder, a pair each, with two further views and with one."""
+    """Write two rendered sets below one folder, of one pair each, with two further views and with one."""
     for name, positions in (("crane", (0.25, 0.5)), ("ship", (0.5,))):
         sample = box_before_a_wall(np.random.default_rng(0), (96, 64))
         pair = pack(sample, {position: sample.left for position in positions})
@@ -33,7 +33,7 @@ def photographs(folder, *names, size=(48, 64)):
         write_image(folder / f"{name}.png", np.full((*size, 3), 100, np.uint8))
 
 
-def test_every_method_has_a_row_a_view_and_a_mean(sets, tmp_path, capfd, monkeypatch):
+def test_every_method_has_a_row_per_view_and_a_mean(sets, tmp_path, capfd, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     out = tmp_path / "out" / "views.csv"
     assert main(f"bench views {sets} -o {out} --threads 1".split()) == 0
@@ -75,12 +75,12 @@ def test_models_can_be_chosen(sets, tmp_path):
         ),
     ],
 )
-def test_a_folder_that_cannot_be_scored_is_told_in_one_line(tmp_path, capfd, pictures, fragment):
+def test_a_folder_that_cannot_be_scored_is_reported_in_one_line(tmp_path, capfd, pictures, fragment):
     photographs(tmp_path / "sets" / "shed", *pictures)
     _refused(tmp_path, capfd, fragment)
 
 
-def test_a_view_of_another_size_is_told_in_one_line(tmp_path, capfd):
+def test_a_view_of_another_size_is_reported_in_one_line(tmp_path, capfd):
     photographs(tmp_path / "sets" / "shed", "left", "right")
     photographs(tmp_path / "sets" / "shed", "view_0.5", size=(48, 60))
     _refused(
@@ -88,11 +88,11 @@ def test_a_view_of_another_size_is_told_in_one_line(tmp_path, capfd):
     )
 
 
-def test_a_model_that_is_not_there_is_told_in_one_line(tmp_path, sets, capfd):
+def test_a_missing_model_is_reported_in_one_line(tmp_path, sets, capfd):
     _refused(tmp_path, capfd, "unknown model 'huge'", "--model huge")
 
 
-def test_a_cluster_that_does_not_answer_is_told_in_one_line(tmp_path, sets, capfd):
+def test_a_cluster_that_does_not_answer_is_reported_in_one_line(tmp_path, sets, capfd):
     _refused(tmp_path, capfd, "127.0.0.1:1: expected the head of a Ray cluster", "--cluster 127.0.0.1:1")
 
 

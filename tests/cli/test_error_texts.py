@@ -111,7 +111,7 @@ def test_many_pairs_have_the_same_texts(capsys):
     assert NOTES["view upper.png lower.png --model small -o out.png"] in low
 
 
-def test_a_video_cannot_be_rectified_so_that_its_notes_do_not_say_it(capsys):
+def test_notes_on_a_video_do_not_advise_rectification(capsys):
     assert main(["video", "upper.png", "lower.png", "--depth", "-o", "out.mkv", "--threads", "1"]) == 0
     (line,) = [line for line in capsys.readouterr().err.splitlines() if "px lower" in line]
     assert line == "0:00:00.000 the right picture lies 2.0 px lower"

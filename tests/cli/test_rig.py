@@ -1,4 +1,4 @@
-"""The commands check and rectify; calibrate has its test in test_calibrate.py, where the boards are."""
+"""The commands check and rectify; calibrate is tested in test_calibrate.py, which has the boards."""
 
 import json
 from pathlib import Path
@@ -19,7 +19,7 @@ LEFT, RIGHT = str(TEXTURED / "left.png"), str(TEXTURED / "right.png")
 
 @pytest.fixture
 def turned(tmp_path) -> str:
-    """The example's right picture as a camera turned by 1 degree sees it."""
+    """Write the example's right picture as seen by a camera turned by 1 degree."""
     right = read_image(RIGHT)
     turn = cv2.getRotationMatrix2D((319.5, 239.5), 1.0, 1.0)
     write_image(
@@ -33,7 +33,7 @@ def test_a_sound_pair_passes_the_check(capsys):
     assert "no defects" in capsys.readouterr().out
 
 
-def test_swapped_pictures_fail_the_check_and_are_told_so(capsys):
+def test_swapped_pictures_fail_the_check_and_are_reported(capsys):
     assert main(["check", RIGHT, LEFT]) == 1
     assert "swapped; give them the other way round" in capsys.readouterr().out
 
@@ -45,7 +45,7 @@ def test_the_check_gives_its_numbers_as_json(turned, capsys):
     assert abs(found["rotation_degrees"]) == pytest.approx(1, abs=0.1)
 
 
-def test_what_is_not_known_of_a_plain_pair_is_null_in_json(tmp_path, capsys):
+def test_unknown_values_of_a_plain_pair_are_null_in_json(tmp_path, capsys):
     write_image(tmp_path / "plain.png", np.full((64, 96, 3), 90, np.uint8))
     assert main(["check", str(tmp_path / "plain.png"), str(tmp_path / "plain.png"), "--json"]) == 1
     found = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
@@ -53,7 +53,7 @@ def test_what_is_not_known_of_a_plain_pair_is_null_in_json(tmp_path, capsys):
     assert found["exposure_ratio"] is None
 
 
-def test_a_pair_is_rectified_by_what_it_shows_into_files_that_fit(turned, tmp_path, capsys):
+def test_a_pair_rectified_by_its_features_passes_the_check(turned, tmp_path, capsys):
     assert main(["rectify", LEFT, turned, "-o", str(tmp_path / "out")]) == 0
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["left.png", "right.png"]
     pair = read_pair(tmp_path / "out" / "left.png", tmp_path / "out" / "right.png")
@@ -61,14 +61,14 @@ def test_a_pair_is_rectified_by_what_it_shows_into_files_that_fit(turned, tmp_pa
     assert "rectified by" in capsys.readouterr().out
 
 
-def test_the_new_calibration_belongs_to_the_new_pictures(tmp_path):
+def test_the_new_calibration_fits_the_new_pictures(tmp_path):
     out = tmp_path / "out"
     assert main(["rectify", LEFT, RIGHT, "--calib", str(TEXTURED / "calib.txt"), "-o", str(out)]) == 0
     pair = read_pair(out / "left.png", out / "right.png")
     assert add_camera(pair, out / "calib.yml").camera == add_camera(pair, TEXTURED / "calib.txt").camera
 
 
-def test_rectification_spares_the_pictures_and_the_calibration_that_are_there(tmp_path, capsys):
+def test_rectification_does_not_overwrite_its_inputs(tmp_path, capsys):
     files = {name: tmp_path / name for name in ("left.png", "right.png", "calib.yml")}
     for path, source in zip(files.values(), (LEFT, RIGHT, TEXTURED / "calib.txt"), strict=True):
         path.write_bytes(Path(source).read_bytes())
@@ -84,14 +84,14 @@ def test_rectification_spares_the_pictures_and_the_calibration_that_are_there(tm
     assert {name: path.read_bytes() for name, path in files.items()} == before
 
 
-def test_a_pair_is_not_rectified_into_a_folder_that_another_command_writes_to(tmp_path, capsys):
+def test_a_pair_is_not_rectified_into_a_folder_to_which_another_command_writes(tmp_path, capsys):
     with lock_output(tmp_path):
         assert main(["rectify", LEFT, RIGHT, "-o", str(tmp_path)]) == 2
     assert "found one that is in use" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 
-def test_depth_and_views_warn_by_themselves_and_rectify_mends(turned, tmp_path, capsys):
+def test_depth_and_view_warn_of_an_unrectified_pair_and_rectify_corrects_it(turned, tmp_path, capsys):
     assert main(["depth", LEFT, turned, "-o", str(tmp_path / "as_it_is")]) == 0
     assert "is turned 1.0 degrees" in capsys.readouterr().out
     assert main(["depth", LEFT, turned, "--rectify", "-o", str(tmp_path / "mended")]) == 0

@@ -38,7 +38,7 @@ def save_matcher(
     keepdims=1,
     multiple_of="1",
 ) -> None:
-    """A matcher file that finds one disparity wherever it looks; the options make it one that is none."""
+    """Write a matcher file that finds one disparity everywhere; the options make it invalid."""
     image = ["batch", 3, *size]
     constants = {"zero": 0.0, "disparity": disparity_px}
     graph = helper.make_graph(
@@ -61,7 +61,7 @@ def save_matcher(
 
 
 def save_identity(path: Path) -> None:
-    """An ONNX file that is in order, and not a matcher."""
+    """Write a valid ONNX file that is not a matcher."""
     x, y = (helper.make_tensor_value_info(name, TensorProto.FLOAT, [1]) for name in "xy")
     graph = helper.make_graph([helper.make_node("Identity", ["x"], ["y"])], "identity", [x], [y])
     onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8), path)
@@ -73,7 +73,7 @@ def truncate(source: Path, target: Path) -> None:
 
 @pytest.fixture
 def pictures(rng, tmp_path, monkeypatch) -> Path:
-    """The folder that the command runs in: a pair of 96x64 and its calibration."""
+    """Write a pair of 96x64 and its calibration to the current folder."""
     monkeypatch.chdir(tmp_path)
     photograph = Image.fromarray(rng.integers(0, 256, (8, 13, 3), dtype=np.uint8)).resize((104, 64))
     left, right = photograph.crop((0, 0, 96, 64)), photograph.crop((8, 0, 104, 64))
@@ -86,7 +86,7 @@ def pictures(rng, tmp_path, monkeypatch) -> Path:
 
 @pytest.fixture
 def mistakes(pictures) -> Path:
-    """The same folder with all that can be wrong beside it."""
+    """Add all kinds of invalid inputs to the folder of `pictures`."""
     left = Image.open("left.png")
     left.save("left.jpg")
     left.crop((0, 0, 80, 64)).save("narrow.png")
@@ -179,7 +179,7 @@ def mistakes(pictures) -> Path:
         ("dept left.png right.png -o out", ["dept", "depth"]),
     ],
 )
-def test_a_mistake_is_told_in_one_line_and_leaves_nothing_behind(mistakes, capfd, arguments, fragments):
+def test_a_mistake_is_reported_in_one_line_and_leaves_nothing_behind(mistakes, capfd, arguments, fragments):
     before = sorted(mistakes.rglob("*"))
     assert run(arguments) == 2
     printed, told = capfd.readouterr()
@@ -198,14 +198,14 @@ def test_view_finds_mistakes_of_its_own_before_it_matches(mistakes, capfd, optio
     assert "nan.onnx" not in capfd.readouterr().err
 
 
-def test_an_error_of_our_own_is_not_taken_for_the_callers(pictures, monkeypatch):
+def test_a_programming_error_is_not_reported_as_a_mistake_of_the_user(pictures, monkeypatch):
     name = "stereoweave.matching.matcher.Matcher.estimate_many"
     monkeypatch.setattr(name, lambda *_, **__: int("our own"))
     with pytest.raises(ValueError, match="our own"):
         run("depth left.png right.png -o out")
 
 
-def test_the_installed_command_tells_a_mistake_in_one_line(mistakes):
+def test_the_installed_command_reports_a_mistake_in_one_line(mistakes):
     command = [Path(sys.executable).with_name("stereoweave"), "depth", "half.png", "right.png", "-o", "out"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 2
@@ -262,7 +262,7 @@ def test_a_side_by_side_picture_gives_the_same_as_the_two(pictures):
     np.testing.assert_array_equal(read_pfm("one/disparity.pfm"), read_pfm("two/disparity.pfm"))
 
 
-def test_json_alone_is_on_stdout_and_names_the_files(pictures, capfd):
+def test_stdout_is_only_json_that_names_the_files(pictures, capfd):
     save_matcher(Path("eight.onnx"), 8.0)
     assert run("depth left.png right.png --model eight.onnx --calib calib.txt -o out --json") == 0
     printed, told = capfd.readouterr()
@@ -279,7 +279,7 @@ def test_json_alone_is_on_stdout_and_names_the_files(pictures, capfd):
 
 
 @pytest.mark.parametrize("command", ["depth", "depth --json", "view"])
-def test_what_is_amiss_with_a_pair_is_part_of_what_is_printed(pictures, capfd, command):
+def test_problems_of_a_pair_are_printed(pictures, capfd, command):
     Image.new("RGB", (96, 64)).save("black.png")
     assert (
         run(f"{command} black.png black.png --threads 1 -o {'out.png' if command == 'view' else 'out'}") == 0
@@ -291,18 +291,18 @@ def test_what_is_amiss_with_a_pair_is_part_of_what_is_printed(pictures, capfd, c
 
 
 @pytest.mark.parametrize("disparity_px", [-3.0, 300.0])
-def test_a_disparity_that_a_png_cannot_hold_gets_none_and_a_line(pictures, capfd, disparity_px):
+def test_a_disparity_that_a_png_cannot_hold_gets_a_note_instead_of_a_png(pictures, capfd, disparity_px):
     save_matcher(Path("far.onnx"), disparity_px)
     assert run("depth left.png right.png --model far.onnx -o out") == 0
     printed, _ = capfd.readouterr()
     (note,) = [line for line in printed.splitlines() if "no disparity.png: it holds 0 to 255.99 px" in line]
     assert note.endswith(" px; use disparity.pfm")
     assert not Path("out/disparity.png").exists()
-    # No disparity that the photographs bear out, which moves it by at most 1 px.
+    # The photographs do not show this disparity, so refinement moves it by at most 1 px.
     np.testing.assert_allclose(read_pfm("out/disparity.pfm"), disparity_px, atol=1.001)
 
 
-def test_a_new_result_takes_the_place_of_the_old_one_whole(pictures):
+def test_a_new_result_replaces_the_old_one_completely(pictures):
     assert run("depth left.png right.png --calib calib.txt -o out") == 0
     Path("out/mine.txt").write_text("kept")
     assert run("depth left.png right.png -o out") == 0
@@ -310,7 +310,7 @@ def test_a_new_result_takes_the_place_of_the_old_one_whole(pictures):
     assert Path("out/mine.txt").read_text() == "kept"
 
 
-def test_view_writes_what_synthesize_draws(pictures):
+def test_view_writes_the_image_that_synthesize_renders(pictures):
     assert run("view left.png right.png --position 0.25 -o view.png") == 0
     left, right = read_image("left.png"), read_image("right.png")
     view = stereoweave.synthesize(left, right, position=0.25)
@@ -323,7 +323,7 @@ def test_bench_scores_the_network_beside_sgbm(pictures, capfd):
     for name in ("left.png", "right.png"):
         Path(name).rename(scene / name)
     truth = np.full((64, 96), 6 * 256, np.uint16)
-    truth[:, :8] = 0  # unknown: the right photograph does not show it
+    truth[:, :8] = 0  # unknown, because the right photograph does not show it
     Image.fromarray(truth).save(scene / "disparity.png")
     save_matcher(Path("eight.onnx"), 8.0)
     assert run("bench pairs scenes --model eight.onnx -o rows.csv") == 0
@@ -334,12 +334,12 @@ def test_bench_scores_the_network_beside_sgbm(pictures, capfd):
         for name in (*OPENCV_MATCHERS, "eight.onnx", "eight.onnx refined")
         for scene in ("wall", "mean")
     }
-    # 8 px found, as the photographs have it, 6 px said to be true
+    # 8 px is found, as in the photographs; 6 px is given as the truth
     assert float(rows["eight.onnx", "wall"]["epe_px"]) == pytest.approx(2, abs=1e-3)
     assert "eight.onnx" in capfd.readouterr().out
 
 
-def test_bench_takes_every_shipped_network_and_says_where_the_rows_are(mistakes, capfd):
+def test_bench_scores_every_shipped_network_and_names_the_file_of_the_rows(mistakes, capfd):
     assert run("bench pairs scenes") == 0
     with Path("pairs.csv").open() as file:
         networks = [name + how for name in shipped_models() for how in ("", " refined")]
@@ -350,7 +350,7 @@ def test_bench_takes_every_shipped_network_and_says_where_the_rows_are(mistakes,
 def test_depth_of_a_large_picture_takes_less_than_a_gigabyte_and_a_half(tmp_path):
     for side in ("left.png", "right.png"):
         Image.open(TEXTURED / side).resize((1920, 1080)).save(tmp_path / side)
-    # In a process of its own, whose only child is the command: Linux counts a parent's memory as its child's.
+    # In a process whose only child is the command, because Linux counts a parent's memory as its child's.
     program = (
         "import resource, subprocess, sys; subprocess.run(sys.argv[1:], check=True); "
         "print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)"
@@ -396,7 +396,7 @@ def test_version_is_the_package_version(capfd):
 
 @pytest.fixture
 def network_run(tmp_path, monkeypatch):
-    """The folder that the command runs in: a network as it begins, `run`, and two pairs held out from it."""
+    """Write an untrained network, `run`, and its two held-out pairs to the current folder."""
     from learn_examples import checkpoint_of, keep_pairs, recipe_of, untrained
 
     from stereoweave.learn.checkpoint import save
@@ -416,22 +416,22 @@ def read_rows(file):
         return list(csv.DictReader(stream))
 
 
-def test_bench_networks_scores_a_run_beside_what_needs_no_training(network_run, capfd):
+def test_bench_networks_scores_a_run_beside_untrained_methods(network_run, capfd):
     assert run("bench networks run -o new/rows.csv") == 0
     rows = {row["method"]: row for row in read_rows("new/rows.csv")}
     assert list(rows) == ["ground truth", "no warping", "sgbm", "median", "run"]
-    # A quarter of the held-out pixels is at 12 px, the others are at 4.
+    # A quarter of the held-out pixels are at 12 px, the others at 4 px.
     assert (float(rows["no warping"]["epe_px"]), float(rows["median"]["epe_px"])) == (6, 2)
     assert "cpu" in rows["run"]
     printed = capfd.readouterr().out
     assert "Means over the held-out pairs" in printed
     assert all(name.split()[0] in printed for name in rows)
-    # Folded where a terminal is narrow, not cut: a run is known by the end of its name.
+    # Names are wrapped in a narrow terminal, not cut, because runs differ at the end of their names.
     assert "…" not in printed
     assert printed.endswith("rows: new/rows.csv\n")
 
 
-def test_bench_networks_takes_a_checkpoint_and_pairs_from_where_it_is_told(network_run):
+def test_bench_networks_accepts_a_checkpoint_and_a_folder_of_pairs(network_run):
     assert run("bench networks run -o beside.csv") == 0
     Path("pairs").rename("kept")
     Path("run/last.pt").rename("run/run.pt")
@@ -450,7 +450,7 @@ def test_bench_networks_takes_a_checkpoint_and_pairs_from_where_it_is_told(netwo
         ("bench networks", ["RUN..."]),
     ],
 )
-def test_a_mistake_with_a_benchmark_of_networks_is_told_in_one_line(mistakes, capfd, arguments, fragments):
+def test_a_mistake_with_bench_networks_is_reported_in_one_line(mistakes, capfd, arguments, fragments):
     before = sorted(mistakes.rglob("*"))
     assert run(arguments) == 2
     printed, told = capfd.readouterr()
@@ -474,7 +474,7 @@ def test_a_mistake_with_a_benchmark_of_networks_is_told_in_one_line(mistakes, ca
         "batch {folder} {link}",
     ],
 )
-def test_a_link_that_leads_nowhere_is_no_place_for_output(tmp_path, capsys, line):
+def test_a_broken_link_is_refused_as_an_output(tmp_path, capsys, line):
     link = tmp_path / "link"
     link.symlink_to(tmp_path / "nowhere")
     places = {"left": TEXTURED / "left.png", "right": TEXTURED / "right.png", "folder": TEXTURED}
@@ -494,6 +494,6 @@ def test_a_link_that_leads_nowhere_is_no_place_for_output(tmp_path, capsys, line
         ("0.0.0.0", "0.0.0.0", None),
     ],
 )
-def test_a_listener_answers_to_its_address_and_to_the_name_that_was_given(address, host, names):
+def test_the_allowed_hosts_are_the_address_of_the_listener_and_the_given_name(address, host, names):
     with listen(address, 0) as listener:
         assert find_allowed_hosts(listener, host) == names

@@ -23,12 +23,12 @@ def run(line: str) -> int:
     return main(line.split())
 
 
-# Making and checking, as a user does
+# Making and checking sets, as users do
 
 
 @pytest.fixture(scope="module")
 def words(tmp_path_factory):
-    """The command line that has just made a set in the folder at its end."""
+    """Make a set. Returns the command line, which ends with the folder of the set."""
     out = tmp_path_factory.mktemp("made") / "set"
     line = f"synth make pylon --pairs 2 --seed 1 --size 160x120 --plain --view 0.5 --jobs 1 -o {out}"
     assert run(line) == 0
@@ -47,7 +47,7 @@ def test_a_set_is_made_once(words, capsys):
 
 
 @pytest.mark.needs_egl
-def test_a_set_is_found_in_order_and_a_damaged_one_ends_with_1(words, capsys):
+def test_a_valid_set_passes_the_check_and_a_damaged_one_exits_with_1(words, capsys):
     out = Path(words.split()[-1])
     assert run(f"synth check {out} --jobs 1") == 0
     told = capsys.readouterr().out
@@ -70,12 +70,12 @@ def test_a_sheet_has_a_row_of_five_pictures_for_each_scene(capsys):
     assert "2/2" in capsys.readouterr().out
     tiles = picture[40:280].reshape(240, 5, 320, 3)
     assert all(tiles[:, column].std() > 5 for column in range(5))
-    # What only one camera sees is orange, and nothing else in the last two columns has a colour.
+    # Pixels that only one camera sees are orange; nothing else in the last two columns has a colour.
     assert (tiles[:, 3].max(axis=2) != tiles[:, 3].min(axis=2)).mean() < 0.5
 
 
 @pytest.mark.needs_egl
-def test_a_quiz_shows_every_scene_and_tells_them_by_place():
+def test_a_quiz_shows_every_scene_and_prints_the_answers_by_place():
     picture, answers = quiz_sheet(shared_renderer(plain=True), ["pylon", "rooms"], seed=2, pictures=6)
     assert picture.shape == (2 * 240, 4 * 320, 3)
     assert sorted(answers) == ["pylon"] * 3 + ["rooms"] * 3
@@ -84,7 +84,7 @@ def test_a_quiz_shows_every_scene_and_tells_them_by_place():
 
 
 @pytest.mark.needs_egl
-def test_the_costs_of_the_effects_are_told_in_milliseconds(monkeypatch, capsys):
+def test_the_costs_of_the_effects_are_printed_in_milliseconds(monkeypatch, capsys):
     monkeypatch.setenv("LP_NUM_THREADS", "1")
     monkeypatch.setattr(
         "stereoweave.synth.sets.effect_costs.measure_effect_costs",
@@ -105,7 +105,7 @@ def test_the_costs_of_the_effects_are_told_in_milliseconds(monkeypatch, capsys):
     assert int(told[0][1]) > int(told[-1][1]) > 0
 
 
-# Mistakes: one line, and 2
+# Mistakes are reported in one line, with exit code 2
 
 
 @pytest.mark.parametrize(
@@ -133,7 +133,7 @@ def test_the_costs_of_the_effects_are_told_in_milliseconds(monkeypatch, capsys):
         ("synth sheet -o sheet.doc", "sheet.doc: expected a picture file ending"),
     ],
 )
-def test_a_mistake_is_answered_in_one_line(tmp_path, monkeypatch, capsys, line, words):
+def test_a_mistake_is_reported_in_one_line(tmp_path, monkeypatch, capsys, line, words):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").touch()
     assert run(line) == 2
@@ -145,7 +145,7 @@ def test_a_mistake_is_answered_in_one_line(tmp_path, monkeypatch, capsys, line, 
 
 
 @pytest.mark.needs_egl
-def test_a_cluster_that_does_not_answer_is_told_in_one_line(tmp_path, capsys):
+def test_a_cluster_that_does_not_answer_is_reported_in_one_line(tmp_path, capsys):
     line = f"synth make pylon --pairs 1 --size 48x32 --plain -o {tmp_path} --cluster 127.0.0.1:1"
     assert run(line) == 2
     told = capsys.readouterr()
@@ -170,14 +170,14 @@ def test_costs_of_an_unknown_scene_are_refused_before_a_renderer_starts(monkeypa
 
 
 @pytest.mark.needs_egl
-def test_what_opengl_has_no_room_for_is_told_in_a_line():
+def test_too_little_opengl_memory_is_reported_in_one_line():
     gl = moderngl.create_context(standalone=True, backend="egl")
     message = error_of(FrameBuffers, gl, (100_000, 32), 2)
     assert message.startswith("pictures of 100000x32 px: expected enough OpenGL memory, found too little (")
     gl.release()
 
 
-def test_without_the_extra_the_answer_names_it(tmp_path):
+def test_without_the_extra_the_error_names_it(tmp_path):
     program = (
         "import sys; sys.modules['skimage'] = None; from stereoweave.cli.root import main; "
         "sys.exit(main(['synth', 'make', 'pylon', '--pairs', '1', '-o', 'set']))"

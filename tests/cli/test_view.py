@@ -1,4 +1,4 @@
-"""The command stereoweave view with layouts: what it writes, says and refuses."""
+"""The command `stereoweave view` with layouts: its files, messages and errors."""
 
 import re
 from pathlib import Path
@@ -22,7 +22,7 @@ def run(line: str) -> int:
 
 @pytest.fixture
 def pair(rng, tmp_path, monkeypatch) -> StereoPair:
-    """The pair of 95x64, 8 px apart, in the folder that the command runs in."""
+    """Write a pair of 95x64 with a disparity of 8 px to the current folder."""
     monkeypatch.chdir(tmp_path)
     photograph = Image.fromarray(rng.integers(0, 256, (8, 13, 3), dtype=np.uint8)).resize((104, 64))
     left, right = photograph.crop((0, 0, 95, 64)), photograph.crop((8, 0, 103, 64))
@@ -46,7 +46,7 @@ def test_a_quilt_of_48_views_matches_once(pair, monkeypatch, capfd):
 
     monkeypatch.setattr(Matcher, "estimate_many", counted)
     assert run("view left.png right.png --layout quilt --threads 1 -o view.png") == 0
-    # The hints match twice more, at half the size.
+    # The notes take two more matches, at half the size.
     assert sizes.count((64, 95)) == 1
     assert set(sizes[1:]) <= {(32, 47)}
     assert read_image("view_qs8x6a1.484.png").shape == (6 * 64, 8 * 95, 3)
@@ -65,7 +65,7 @@ def test_a_quilt_of_48_views_matches_once(pair, monkeypatch, capfd):
         ("--layout rgbd -o v.png", "v_RGBD.png", "rgbd", 1.0, 0.0),
     ],
 )
-def test_a_layout_is_made_of_one_estimate_at_its_strength_and_plane(
+def test_a_layout_is_rendered_from_one_estimate_with_strength_and_convergence(
     pair, arguments, file, layout, strength, convergence_px
 ):
     before = set(Path().iterdir())
@@ -79,12 +79,12 @@ def test_a_layout_is_made_of_one_estimate_at_its_strength_and_plane(
     np.testing.assert_array_equal(np.asarray(Image.open(file)), expected)
 
 
-def test_the_middle_of_the_scene_is_where_it_is(pair):
+def test_the_median_disparity_of_a_wall_is_its_own(pair):
     estimate = Matcher("small", threads=1).estimate(pair.left, pair.right)
     assert median_disparity_px(estimate) == pytest.approx(8, abs=0.5)
 
 
-def test_a_single_view_keeps_to_strength_and_says_what_neither_camera_saw(pair, capfd):
+def test_a_single_view_uses_strength_and_reports_the_share_that_neither_camera_saw(pair, capfd):
     arguments = "view left.png right.png --model small --threads 1"
     assert run(f"{arguments} --position 1.5 --strength 0.5 -o narrow.png") == 0
     assert run(f"{arguments} --position 1 -o right_again.png") == 0
@@ -93,7 +93,7 @@ def test_a_single_view_keeps_to_strength_and_says_what_neither_camera_saw(pair, 
     assert "narrow.png: view at 1.5, 0.0 % of it seen by neither camera" in capfd.readouterr().out
 
 
-def test_a_file_can_ask_for_its_layout_by_its_ending(pair):
+def test_the_extension_of_a_file_can_select_the_layout(pair):
     assert run("view left.png right.png --model small -o v.mpo") == 0
     assert run("view left.png right.png --model small -o v.jps") == 0
     with Image.open("v.mpo") as file:
@@ -105,7 +105,7 @@ def test_a_file_can_ask_for_its_layout_by_its_ending(pair):
 
 @pytest.mark.parametrize("ending", [".gif", ".webp", ".mp4"])
 def test_a_wiggle_moves(pair, capfd, ending):
-    # Around 0 px: the pair is one wall, which stays in place around its own disparity, as the frames do then.
+    # At convergence 0, because at the wall's own disparity, the wall would stay in place in all frames.
     wiggle = "--layout wiggle --convergence 0 --model small --threads 1"
     assert run(f"view left.png right.png {wiggle} -o v{ending}") == 0
     count = len(ANIMATIONS["wiggle"].positions)
@@ -146,7 +146,7 @@ def test_a_wiggle_moves(pair, capfd, ending):
         ("--layout rgbd -o taken.png", ["taken_RGBD.png", "expected a file", "found a folder"]),
     ],
 )
-def test_a_mistake_is_told_in_one_line_before_anything_is_matched(
+def test_a_mistake_is_reported_in_one_line_before_anything_is_matched(
     pair, monkeypatch, capfd, arguments, fragments
 ):
     def unmatched(*_, **__):
@@ -164,7 +164,7 @@ def test_a_mistake_is_told_in_one_line_before_anything_is_matched(
     assert sorted(Path().rglob("*")) == before
 
 
-def test_the_help_names_every_layout_and_motion(capfd):
+def test_the_help_names_every_layout_and_animation(capfd):
     assert run("view --help") == 0
     words = set(re.findall(r"\w+", capfd.readouterr().out))
     assert {*LAYOUTS, *ANIMATIONS} <= words

@@ -50,7 +50,7 @@ QUIET = Console(quiet=True)
 
 @pytest.fixture(autouse=True)
 def models():
-    """Networks as they were before; an ablation adds its own."""
+    """Restore the networks after a test, because an ablation adds its own."""
     with patch.dict(MODELS):
         yield
 
@@ -73,7 +73,7 @@ def runs(tmp_path):
 
 @pytest.fixture
 def trained(monkeypatch):
-    """Names of what was trained: with random weights, in no time."""
+    """Return the names of the trained recipes; training is replaced by random weights, which is fast."""
     names = []
 
     def train_recipe(recipe, out, console):
@@ -83,7 +83,7 @@ def trained(monkeypatch):
         return out / "last.pt"
 
     monkeypatch.setattr(ablations, "train_recipe", train_recipe)
-    # Of a picture this small it is counted in no time too.
+    # Counting is fast too with so small a picture.
     monkeypatch.setattr(ablations, "count_multiply_adds", partial(count_multiply_adds, height=32, width=64))
     return names
 
@@ -101,7 +101,7 @@ def test_every_choice_has_a_variation():
     assert [choice for choice in CHOICES if not VARIATIONS.get(choice)] == []
 
 
-def test_a_variation_differs_from_the_base_in_what_it_says_alone():
+def test_a_variation_differs_from_the_base_only_in_its_changes():
     base = asdict(read_recipe(SHIPPED))
     for trial in plan(read_recipe(SHIPPED), 2):
         ours = asdict(trial.recipe)
@@ -145,7 +145,9 @@ def test_each_training_is_a_row_with_the_scores_on_both_kinds_of_pairs(rendered,
         assert 0 <= float(base[name]) <= 192
 
 
-def test_what_has_a_row_is_not_trained_again_and_another_recipe_is(rendered, runs, trained, tmp_path):
+def test_a_training_with_a_row_is_not_repeated_and_another_recipe_is_trained(
+    rendered, runs, trained, tmp_path
+):
     report = tmp_path / "ablations.csv"
     run_ablations(two_trials()[:1], runs, rendered, report, QUIET)
     (first,) = read(report)

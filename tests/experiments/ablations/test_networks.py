@@ -11,7 +11,7 @@ from stereoweave.learn.models.layers import local_soft_argmax
 from stereoweave.learn.training.losses import weave_losses
 
 CONTEXT = "aggregation.context"
-# The parts that are not there, or have another shape, in one of the two.
+# Parts that only one of the two networks has, or that have another shape.
 DIFFERENT = {
     "weave_small_eighth": {"to_match", "aggregation.down", "aggregation.join", "aggregation.scores",
                            "weights_of_eighth"},
@@ -43,7 +43,7 @@ def shapes(network):
 
 
 def alike(name):
-    """The variant and SMALL, with the same weights wherever both have them."""
+    """Return the variant and SMALL, with equal weights wherever both have them."""
     variant, small = untrained(name), untrained()
     small_shapes = shapes(small)
     shared = {k: v for k, v in variant.state_dict().items() if small_shapes.get(k) == tuple(v.shape)}
@@ -68,7 +68,7 @@ def test_a_variant_has_other_parameters_only_where_its_name_says(name):
 def test_a_variant_gives_finite_maps_of_the_pictures_size_that_are_not_those_of_small(name):
     variant, small = alike(name)
     if name == "weave_small_without_context":
-        # At first it adds nothing.
+        # At initialisation, it adds nothing.
         nn.init.normal_(small.aggregation.context.up.weight)
     torch.manual_seed(1)
     pair = torch.rand(2, 2, 3, 32, 64)
@@ -117,8 +117,8 @@ def test_the_correlation_of_all_groups_together_is_that_without_groups():
     torch.testing.assert_close(grouped, small, atol=1e-5, rtol=1e-4)
 
 
-def test_a_group_is_seen_for_itself():
-    """Scores change where one group's loss is another one's gain, though their sum stays as it is."""
+def test_each_group_is_used_separately():
+    """Scores change if one group decreases and another increases, although their sum stays the same."""
     network = untrained("weave_small_grouped")
     volume, features = torch.zeros(2, network.levels, 8, 16), network.encoder(torch.rand(2, 3, 32, 64))
     with torch.no_grad():

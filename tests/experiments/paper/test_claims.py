@@ -42,7 +42,7 @@ def row(claim, setting, seed=0, model="fast_depth", steps=600, **scores):
 
 
 def projected(*less):
-    """Rows of as many seeds, in each of which the projection loss makes so many percent less error."""
+    """Return rows of one seed per value, the percentage by which the projection loss reduces the error."""
     without = [row(PROJECTION, "without", seed, epe_px=2.0) for seed in range(len(less))]
     return without + [
         row(PROJECTION, PAPER, seed, epe_px=2 * (1 - value / 100)) for seed, value in enumerate(less)
@@ -50,12 +50,12 @@ def projected(*less):
 
 
 def line_of(table, text):
-    """The cells of the line that begins with this text."""
+    """Return the cells of the line that begins with this text."""
     (line,) = (line for line in table.splitlines() if line.startswith(f"| {text} |"))
     return [cell.strip() for cell in line.strip("|").split("|")][1:]
 
 
-def test_less_is_counted_from_the_reference():
+def test_a_reduction_is_relative_to_the_reference():
     assert reduction_percent(4.0, 3.0) == 25
     assert reduction_percent(4.0, 5.0) == -25
 
@@ -70,11 +70,11 @@ def test_a_seed_is_compared_with_itself():
         row(ADJUSTMENT, PAPER, 1, epe_px=90.0),
     ]
     random.Random(0).shuffle(rows)
-    # Only 1 and 2 have both: 8 of 10, 10 of 20.
+    # Only seeds 1 and 2 have both settings: 8 instead of 10, and 10 instead of 20.
     assert reductions_by_seed(rows, COMPARISONS[PROJECTED]) == pytest.approx([20, 50])
 
 
-def test_half_of_the_interval_is_students():
+def test_the_interval_is_students():
     # t is 4.303 for two degrees of freedom, 12.706 for one; the deviations are 1 and sqrt(2).
     assert interval_half_width([1.0, 2.0, 3.0]) == pytest.approx(4.303 / math.sqrt(3), rel=1e-3)
     assert interval_half_width([0.0, 2.0]) == pytest.approx(12.706, rel=1e-4)
@@ -96,7 +96,7 @@ def test_a_claim_holds_where_its_whole_interval_does(less, measured, difference,
     assert cells == ["about 20 %, up to 25 %", measured, difference, verdict]
 
 
-def test_what_has_no_rows_is_not_run():
+def test_a_claim_without_rows_is_listed_as_not_run():
     lines = claims_table([]).splitlines()[2:]
     assert len(lines) == len(COMPARISONS) == 15
     assert all(line.endswith("| not run | | |") for line in lines)
@@ -133,7 +133,7 @@ def test_losses_in_codes_of_two_exponents_decide_nothing():
     ("less", "verdict"),
     [((20, 21, 22), "better"), ((-9, 1, 11), "undecided"), ((-20, -21, -22), "the opposite")],
 )
-def test_what_the_paper_has_no_number_of_has_no_difference(less, verdict):
+def test_a_claim_without_a_number_in_the_paper_has_no_difference(less, verdict):
     reference = [row(DECODER, "upsampled at once, no skips", seed, epe_px=2.0) for seed in range(3)]
     changed = [row(DECODER, PAPER, seed, epe_px=2 * (1 - value / 100)) for seed, value in enumerate(less)]
     cells = line_of(claims_table(reference + changed), "step-wise decoder with skips: end-point error")
@@ -176,7 +176,7 @@ def test_the_settings_of_a_claim_are_ranked_by_the_mae_of_the_filled_view():
         row(ADJUSTMENT, "p = 1", 0, mae_filled=1.0),
     ]
     header, _, first, second = settings_table(rows, PROJECTION).splitlines()
-    # Means over the seeds; of 1 and 3 the deviation is sqrt(2).
+    # Means over the seeds; the deviation of 1 and 3 is sqrt(2).
     assert first == (f"| {PAPER} | 2 | 2.00 ± 1.41 | 1.00000 | 7.00 | 5.00 | 1.0 | 1.00 | 1.000 | 1.0 |")
     assert second == "| without | 1 | 1.00 | 1.00000 | 9.00 | 1.00 | 1.0 | 1.00 | 1.000 | 1.0 |"
     assert header.count("|") == first.count("|")
@@ -221,7 +221,7 @@ def test_the_settings_of_depth_have_their_errors_in_cm_first():
     rows = [row(PROJECTION, PAPER, seed, epe_cm=error) for seed, error in enumerate((30.0, 50.0))]
     header, _, line = settings_table(rows, PROJECTION, depth=True).splitlines()
     assert header.startswith("| setting | seeds | EPE cm | EPE px | ")
-    # Of 30 and 50 the deviation is 10 sqrt(2).
+    # The deviation of 30 and 50 is 10 sqrt(2).
     assert line.startswith(f"| {PAPER} | 2 | 40.0 ± 14.1 | 1.00 | ")
     assert header.count("|") == line.count("|")
 

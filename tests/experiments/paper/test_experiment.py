@@ -44,7 +44,7 @@ from stereoweave.learn.training.run import TrainingRun
 from stereoweave.stereo import fit_exponent
 
 QUIET = Console(quiet=True)
-# A thread each, so that a training in place leaves the number of threads as it is.
+# One thread each, so that a training in this process keeps the number of threads.
 JOBS = os.cpu_count() or 1
 SIZE = (64, 64)
 BASE = recipe_of(
@@ -84,7 +84,7 @@ ROWS = [
 
 @dataclass(frozen=True)
 class Experiment:
-    """A plan, of which `TRAINED` is trained, and the report of it."""
+    """A plan of which the trials `TRAINED` are trained, and its report."""
 
     planned: list[Trial]
     runs: Path
@@ -98,7 +98,7 @@ class Experiment:
 
 
 def train_in_place(patch):
-    """Have trainings and their batches come in this process: each new one takes seconds to load PyTorch."""
+    """Run trainings and load batches in this process, because a new one takes seconds to load PyTorch."""
     patch.setattr(paper, "ProcessPoolExecutor", lambda jobs, mp_context: ThreadPoolExecutor(1))
     make_batches_in_place(patch)
 
@@ -130,7 +130,7 @@ def experiment(tmp_path_factory):
 
 
 def fitted_name():
-    """Three quarters of the training truth are at 12 px, and a quarter at 14 px, of 16 px."""
+    """Return the recipe name for the exponent fitted to 3/4 of the truth at 12 px and 1/4 at 14 px."""
     counts = np.zeros(256)
     counts[256 * 12 // 16], counts[256 * 14 // 16] = 3, 1
     return f"fast_depth-l2-p{fit_exponent(counts):g}-projection1-steps4-seed0"
@@ -160,7 +160,7 @@ def test_the_exponent_is_fitted_to_the_training_truth(experiment):
             "model = 'weave_small', expected 'fast_depth', which the experiment starts from",
         ),
         ({"target": "depth"}, "target = 'depth', expected 'disparity', which the experiment starts from"),
-        ({"steps": 3}, "steps = 3, expected at least 4: some trainings have a quarter of them"),
+        ({"steps": 3}, "steps = 3, expected at least 4, because some trainings take a quarter of them"),
     ],
 )
 def test_a_plan_starts_from_the_papers_network_and_of_collages_from_disparity(tmp_path, changes, words):
@@ -189,7 +189,7 @@ def test_a_training_has_a_row_for_each_claim_that_it_serves(experiment):
         assert float(row["exponent"]) == kept.recipe.exponent
         assert float(row["alpha_p"]) == kept.recipe.alpha_p
         assert row["crop"] == "64x64"
-        # What training scored last, and what the evaluation finds on the same pairs.
+        # The last scores of the training, and those of the evaluation on the same pairs.
         for measure in ("prediction", "squared_error", "epe_px"):
             assert float(row[measure]) == pytest.approx(kept.scores[measure], rel=1e-4)
 
@@ -201,7 +201,7 @@ def test_the_tables_name_what_was_not_run(experiment):
     names.add("fast_depth-l2-p1.25-projection1-steps4-seed0")
     assert not_run == [word for name in sorted(names) for word in ("-", name)]
     assert "against dispnet: end-point error | " in text
-    # Against DispNet and PSMNet two each, and the decoder.
+    # Two each against DispNet and PSMNet, and the decoder.
     assert text.count("| not run | | |") == 6
     assert [line for line in text.splitlines() if line.startswith("| no warping | 6.00 | ")]
     assert "## Transfer" not in text
@@ -228,7 +228,7 @@ def test_every_figure_of_what_was_trained_can_be_read(experiment):
     assert pictures["views.jpg"].shape[0] == 2 * 286 + 39
 
 
-def test_started_again_it_trains_what_is_missing_alone(experiment, in_place, monkeypatch):
+def test_a_resumed_experiment_trains_only_what_is_missing(experiment, in_place, monkeypatch):
     steps, step = [], TrainingRun.step
     monkeypatch.setattr(
         TrainingRun, "step", lambda run, *rest: steps.append((run.recipe.name, rest[0])) or step(run, *rest)
@@ -298,7 +298,7 @@ def report_of(trained, curves):
 
 
 def transfer_of(scratch, tuned):
-    """What the report says of two trainings with these (step, loss)."""
+    """Return what the report says of two trainings with these (step, loss) curves."""
     trained = [trial for trial in list_trials(BASE, 1, 1.37) if trial.claim == TRANSFER]
     curves = [[{"step": step, "loss": loss} for step, loss in curve] for curve in (scratch, tuned)]
     named = {trial.recipe.name: curve for trial, curve in zip(trained, curves, strict=True)}
@@ -336,7 +336,7 @@ def test_a_fitted_exponent_that_was_planned_anyway_is_named_and_drawn_once():
 
 @pytest.fixture(scope="module")
 def on_disk(tmp_path_factory):
-    """The experiment on depth, of ten pairs in the paper's layout: the wall is 6 m away, the box 2 m."""
+    """Return the experiment on depth, on ten pairs in the paper's layout: a wall at 6 m and a box at 2 m."""
     folder = tmp_path_factory.mktemp("propeller")
     root, runs, out = folder / "set", folder / "runs", folder / "report"
     for index in range(10):
@@ -388,7 +388,7 @@ def test_the_tables_of_depth_stand_beside_the_papers_propeller(on_disk):
         ["| psmnet", "1", "2.38"],
         ["| fast_depth", "4", "2.32"],
     ]
-    # Without a disparity everything is at 8 m: three quarters of the pixels are wrong by 2 m, the box by 6 m.
+    # Without disparity, everything is at 8 m: three quarters of the pixels are off by 2 m, the box by 6 m.
     assert [line for line in text.splitlines() if line.startswith("| no warping | 300.0 | 6.00 | ")]
     assert [line for line in text.splitlines() if line.startswith("| ground truth | 0.0 | 0.00 | ")]
     names = {file.name for file in on_disk.out.iterdir()}
@@ -419,13 +419,13 @@ def test_a_report_of_nothing_is_refused(tmp_path):
     planned = list_trials(BASE, 1, 1.37)
     names = {trial.recipe.name for trial in planned}
     assert complaint(write_report, BASE, planned, tmp_path / "runs", out) == (
-        f"{tmp_path}/runs: expected a trial trained to its end, found none of {len(names)}; "
+        f"{tmp_path}/runs: expected at least one finished trial, found none of {len(names)}; "
         "run `python -m experiments.paper`"
     )
     assert not out.exists()
 
 
-def test_the_head_says_what_is_not_the_papers(experiment):
+def test_the_report_states_the_differences_from_the_paper(experiment):
     text = (experiment.out / "paper.md").read_text().split("## The claims")[0]
     for words in ("averaged over about 1 steps", "to a norm of 5", torch.__version__, "± is the standard"):
         assert words in text

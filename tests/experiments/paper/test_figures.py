@@ -15,7 +15,7 @@ CURVES = {
 
 
 def pixels_of(picture, rgb):
-    """How many pixels are of that colour, as a PNG keeps it."""
+    """Return the number of pixels of a colour in a PNG."""
     return int((picture == np.round(np.array(rgb) * 255)).all(2).sum())
 
 
@@ -64,7 +64,7 @@ def test_the_iterations_stand_between_the_left_image_and_the_truth_in_its_colour
     picture = drawn(tmp_path / "iterations.png", figures.draw_iterations, rows)
     row = picture[int(0.58 * picture.shape[0])]
     places = [row[round(share * picture.shape[1])] for share in (3 / 8, 5 / 8, 7 / 8)]
-    # Beside its middle, the truth shows the box too.
+    # At the sampled place, the truth shows the box, as the second estimate does.
     assert (places[0] != places[1]).any()
     np.testing.assert_array_equal(places[1], places[2])
     ends = cv2.applyColorMap(np.array([[0, 255]], np.uint8), cv2.COLORMAP_TURBO)[0, :, ::-1]
@@ -78,7 +78,7 @@ def test_the_views_show_black_where_nothing_lands(tmp_path, rng):
     black = drawn(tmp_path / "black.png", figures.draw_views, [(sample, {"ours": nowhere})])
     assert moved.shape == black.shape
     quarter = moved.shape[1] // 4
-    # What precedes the last column is the same in both, and the last one is black in the second.
+    # The columns before the last are the same in both rows; the last one is black in the second row.
     np.testing.assert_array_equal(moved[:, : 3 * quarter], black[:, : 3 * quarter])
     middle = np.s_[moved.shape[0] // 2, 3 * quarter + 20 : -20]
     assert moved[middle].any()

@@ -25,7 +25,7 @@ PLAIN = {"exponent": 1.0, "alpha_p": 0.0}
 DENSEMAPNET = {"model": "densemapnet", **PLAIN}
 DISPNET = {"model": "dispnet", **PLAIN, "loss": "l1", "learning_rate": 1e-4}
 PSMNET = {"model": "psmnet", **PLAIN, "loss": "smooth_l1"}
-# Collages of 96x64 and 32 px, half as large again.
+# Collages of 96x64 with 32 px of disparity, enlarged by half.
 OTHER = {"seed": 100, "pairs": 500, "pair_size": (96, 144), "max_disparity_px": 48.0}
 FIRST = "fast_depth-l2-p1.5-projection1-steps600-seed5"
 DIFFERENCES = {
@@ -64,12 +64,12 @@ SEVERAL = {
 
 
 def difference(recipe):
-    """Where a recipe is not the base's, its name aside."""
+    """Return the keys, except the name, in which a recipe differs from the base."""
     ours, theirs = asdict(recipe), asdict(BASE)
     return {field: ours[field] for field in ours if ours[field] != theirs[field] and field != "name"}
 
 
-def test_a_trial_differs_from_the_base_in_what_its_setting_says_alone():
+def test_a_trial_differs_from_the_base_only_in_its_setting():
     found = {(trial.claim, trial.setting): difference(trial.recipe) for trial in list_trials(BASE, 1, 1.37)}
     assert found == DIFFERENCES
     assert {claim for claim, _ in found} == set(CLAIMS)

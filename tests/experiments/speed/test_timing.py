@@ -14,7 +14,7 @@ SHARE = HEIGHT * WIDTH / (480 * 640)
 
 @pytest.fixture(scope="module")
 def timed():
-    """Rows of the two cheap networks at a small size, what was called, and the graphs."""
+    """Return the rows of the two cheap networks at a small size, the calls made, and the graphs."""
     graphs, calls = [], {}
     with pytest.MonkeyPatch.context() as patch:
         exported, measure_ms = speed.export_fixed_graph, speed._measure_ms
@@ -27,7 +27,7 @@ def timed():
         patch.setattr(
             speed, "_measure_ms", lambda given, turns: calls.update(given) or measure_ms(given, turns)
         )
-        # A recipe of another kind: what is timed does not depend on its loss.
+        # A recipe with another loss, on which timing does not depend.
         rows = speed.measure_run_times(RECIPE, ("fast_depth", "densemapnet"), turns=2)
         torch.manual_seed(0)
     return {row.network: row for row in rows}, calls, graphs
@@ -48,7 +48,7 @@ def test_a_row_has_the_published_parameters_and_multiply_adds(timed):
         "fast_depth": 314_722,
         "densemapnet": 290_290,
     }
-    # At 640x480, 7.39 and 8.41 thousand million.
+    # 7.39 and 8.41 billion at 640x480.
     assert rows["fast_depth"].multiply_adds == pytest.approx(7.39e9 * SHARE, rel=2e-3)
     assert rows["densemapnet"].multiply_adds == pytest.approx(8.41e9 * SHARE, rel=2e-3)
 
@@ -59,7 +59,7 @@ def test_what_is_timed_in_both_runtimes_gives_the_same_disparity(timed):
         (expected_px,), (found_px,) = eager(), in_onnx()
         assert expected_px.shape == (1, 1, HEIGHT, WIDTH)
         np.testing.assert_allclose(found_px, expected_px.numpy(), atol=0.01)
-    # Random weights, but different ones: the two networks do not answer alike.
+    # The two networks have different random weights, so their outputs differ.
     assert np.abs(calls["fast_depth"][1]()[0] - calls["densemapnet"][1]()[0]).max() > 1
 
 

@@ -19,7 +19,7 @@ HEIGHT, WIDTH = 32, 64
 
 
 def noted(operation, read, given, *modules):
-    """A node as the exporter writes it, with the modules that it was called in."""
+    """Return a node as the exporter writes it, annotated with the modules that called it."""
     node = helper.make_node(operation, read, [given], f"node_{given}")
     note = node.metadata_props.add()
     note.key, note.value = "pkg.torch.onnx.name_scopes", str(["", *modules, given])
@@ -27,7 +27,7 @@ def noted(operation, read, given, *modules):
 
 
 def graph_of(nodes, shapes, given, constants=()):
-    """A graph of those nodes; its inputs are all of `shapes`."""
+    """Return a graph of these nodes, with `shapes` as its inputs."""
     inputs = [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name, shape in shapes.items()]
     outputs = [helper.make_tensor_value_info(name, TensorProto.FLOAT, None) for name in given]
     graph = helper.make_graph(nodes, "graph", inputs, outputs, list(constants))
@@ -35,7 +35,7 @@ def graph_of(nodes, shapes, given, constants=()):
 
 
 def measure_small_pairs(run):
-    """Rows of a run for pairs of WIDTH x HEIGHT; MODELS stays as it was."""
+    """Return the rows of a run for pairs of WIDTH x HEIGHT; MODELS is restored."""
     with pytest.MonkeyPatch.context() as monkeypatch, patch.dict(MODELS):
         monkeypatch.setattr(costs, "HEIGHT_PX", HEIGHT)
         monkeypatch.setattr(costs, "WIDTH_PX", WIDTH)
@@ -45,7 +45,7 @@ def measure_small_pairs(run):
 
 @pytest.fixture(scope="module")
 def rows(tmp_path_factory):
-    """The network of a small run, and the run's rows."""
+    """Return the network of a small run, and its rows."""
     file = tmp_path_factory.mktemp("run") / "last.pt"
     network = untrained()
     checkpoint.save(checkpoint_of(network), file)
@@ -170,10 +170,10 @@ def test_the_product_is_the_peak_and_the_stages_come_in_order_with_their_total(r
 def test_the_total_is_what_the_stages_sum_to(rows):
     network, (product, *stages, total) = rows
     assert sum(row.multiply_adds for row in stages) == total.multiply_adds
-    # Every kernel is in a stage.
+    # Every kernel belongs to a stage.
     assert sum(row.moved_mb for row in stages) == pytest.approx(total.moved_mb)
     assert total.one_thread_ms >= max(row.one_thread_ms for row in stages) > 0
-    # Beside what the network's card counts, the sums of weighted neighbours.
+    # The network's card does not count the sums of weighted neighbours.
     assert total.multiply_adds == pytest.approx(count_multiply_adds(network, HEIGHT, WIDTH), rel=0.02)
     speed, peak = total.multiply_adds / total.one_thread_ms, product.multiply_adds / product.one_thread_ms
     assert total.one_thread_peak_percent == pytest.approx(100 * speed / peak)
