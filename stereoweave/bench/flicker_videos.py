@@ -184,7 +184,7 @@ def add_passing_oval(
 def _paste_oval(
     image: UInt8[np.ndarray, "h w 3"], picture: UInt8[np.ndarray, "h w 3"], left_px: float, top_px: float
 ) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
-    """Return the image with an oval pasted in, and the mask of pixels that are at least half covered by it.
+    """Return the image with an oval pasted in, and the mask of the pixels that are at least half covered.
 
     Args:
         image: The background.

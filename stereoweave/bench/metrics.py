@@ -47,13 +47,13 @@ def epe_px(estimate_px: Float[np.ndarray, "h w"], truth_px: Float[np.ndarray, "h
 def bad_percent(
     estimate_px: Float[np.ndarray, "h w"], truth_px: Float[np.ndarray, "h w"], threshold_px: float
 ) -> float:
-    """Return the percentage of known pixels that are off by more than threshold_px (Middlebury's bad-n)."""
+    """Return the percentage of known pixels off by more than threshold_px (Middlebury's bad-n)."""
     error_px, _ = _known_errors(estimate_px, truth_px)
     return 100 * _mean(~(error_px <= threshold_px))
 
 
 def d1_percent(estimate_px: Float[np.ndarray, "h w"], truth_px: Float[np.ndarray, "h w"]) -> float:
-    """Return the percentage of known pixels that are off by more than 3 px and 5 % (KITTI 2015's D1)."""
+    """Return the percentage of known pixels off by more than 3 px and more than 5 % (KITTI 2015's D1)."""
     error_px, known_px = _known_errors(estimate_px, truth_px)
     return 100 * _mean(~((error_px <= 3) | (error_px <= 0.05 * np.abs(known_px))))
 
@@ -75,12 +75,12 @@ def mae(
 
 
 def psnr_db(image: UInt8[np.ndarray, "h w 3"], truth: UInt8[np.ndarray, "h w 3"]) -> float:
-    """Return the peak signal-to-noise ratio of two images in dB; equal images have 148 dB."""
+    """Return the peak signal-to-noise ratio of two images in dB, at most 148 dB for equal images."""
     return float(10 * np.log10(255**2 / max(_mean(_subtract(image, truth) ** 2), 1e-10)))
 
 
 def ssim(image: UInt8[np.ndarray, "h w 3"], truth: UInt8[np.ndarray, "h w 3"]) -> float:
-    """Return the mean structural similarity of two images' 8-bit luminance; 1 if it is equal.
+    """Return the mean structural similarity of two images' 8-bit luminance; 1 if both are equal.
 
     Source: Wang et al. 2004, with an 11x11 Gaussian window of sigma 1.5, K1 = 0.01 and K2 = 0.03. Borders are
     mirrored.
@@ -145,7 +145,7 @@ def _average_kept(
 def _known_errors(
     estimate: Float[np.ndarray, "h w"], truth: Float[np.ndarray, "h w"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Return the absolute errors at the pixels of known truth, and their truth."""
+    """Return the absolute errors and the truth at the pixels of known truth."""
     _check_shapes(estimate, truth)
     known = np.isfinite(truth)
     known_truth = truth[known].astype(np.float64)

@@ -1,4 +1,4 @@
-"""OpenCV's matchers, set as in OpenCV's sample, and their hole filling and left-right confidence."""
+"""OpenCV's matchers with the settings of OpenCV's sample, hole filling, and left-right confidence."""
 
 from collections.abc import Callable
 from functools import partial

@@ -145,7 +145,7 @@ def describe_machine() -> dict[str, str]:
 
 
 def _average_known(values: Sequence[Any]) -> Any:
-    """Return the mean of the numbers, or of the arrays of equal shape, without NaN; NaN if all have NaN."""
+    """Return the mean of the numbers, or of the arrays, that contain no NaN; NaN if there are none."""
     known = [value for value in values if not np.isnan(value).any()]
     return np.mean(known, axis=0) if known else values[0]
 

@@ -77,7 +77,7 @@ def fill_unknown(disparity_px: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h
 def _find_occluded_from(
     disparity_px: Float[np.ndarray, "h w"], side_px: Float[np.ndarray, "h w"], way: float
 ) -> Bool[np.ndarray, "h w"]:
-    """Return the mask of the view's pixels that one image does not show; for `way` see `land_disparities`."""
+    """Return the mask of the view's pixels that an image does not show; for `way` see `land_disparities`."""
     if way < 0:
         # The image was taken to the left of the view; after mirroring, it lies to the right.
         return _find_occluded_from(disparity_px[:, ::-1], side_px[:, ::-1], -way)[:, ::-1]

@@ -15,7 +15,7 @@ def app(
 ) -> None:
     """Serve a web page that shows depth and views of uploaded pairs.
 
-    The page also rotates point clouds, measures distances and offers all results for download.
+    The page also shows point clouds, measures distances and offers all results for download.
     """
     from stereoweave.matching.providers import check_provider
 

@@ -61,8 +61,8 @@ def live(  # noqa: PLR0913 - each is an option of the command line
     format = replace_old_option(("--arrangement", arrangement), ("--format", format))
     if format not in (None, *PAIR_LAYOUTS) or (format and len(sources) > 1):
         raise StereoweaveError(
-            f"expected one of {', '.join(PAIR_LAYOUTS)}, of one source with both views, found {format} of "
-            f"{' '.join(sources)}",
+            f"expected one of {', '.join(PAIR_LAYOUTS)}, for frames of one source with both views, "
+            f"found {format} of {' '.join(sources)}",
             setting="format",
         )
     rig = read_rig(calib) if calib else None

@@ -138,7 +138,7 @@ def make_request(
     baseline_m: float | None = None,
     rectify: bool = False,
 ) -> "Request":
-    """Return the `Request` that the options of a command line make."""
+    """Return the `Request` that the options of a command line describe."""
     from stereoweave.pictures.prepare import Request
 
     return Request(

@@ -58,8 +58,8 @@ def rectify(
 ) -> None:
     """Rectify a pair by its calibration or by matched features.
 
-    Features are matched if there is no --calib. The pictures are cropped to their common area. With --calib,
-    calib.yml is the calibration of the results.
+    Without --calib, features of the pictures are matched. The pictures are cropped to their common area. With
+    --calib, calib.yml is the calibration of the results.
     """
     from stereoweave.cameras.calibration_files import write_rig
     from stereoweave.cameras.rectify import crop

@@ -63,7 +63,7 @@ def make(  # noqa: PLR0913 - each is an option of the command
     ] = None,
     cluster: Cluster = None,
 ) -> None:
-    """Render a set of pairs, or resume or extend one."""
+    """Render a set of pairs, or resume or extend an existing one."""
     with require_synth_extra():
         from stereoweave.synth.sets.make import PairRenderer
         from stereoweave.synth.sets.make import make as make_set

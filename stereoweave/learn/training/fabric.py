@@ -1,4 +1,4 @@
-"""The process that trains: its device, its process group under torchrun, and its memory."""
+"""Device, process group under torchrun, and memory of a training process."""
 
 import atexit
 import ctypes

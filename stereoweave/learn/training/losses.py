@@ -61,7 +61,7 @@ def weave_losses(
 def level_cross_entropy(
     scores: Float[Tensor, "b d h w"], truth: Float[Tensor, "b 1 h w"]
 ) -> Float[Tensor, ""]:
-    """Return the cross-entropy over levels; the target is split linearly between the two nearest ones."""
+    """Return the cross-entropy over levels, whose target is split linearly between the two nearest levels."""
     levels = scores.shape[1]
     known = (truth >= 0) & (truth <= levels - 1)
     truth = truth.where(known, 0)
@@ -74,10 +74,10 @@ def level_cross_entropy(
 def regression_loss(
     estimate_px: Float[Tensor, "b 1 h w"], truth_px: Float[Tensor, "b 1 h w"], robust: float = 0.0
 ) -> Float[Tensor, ""]:
-    """Return the mean absolute error, quadratic below 0.5 px, mixed with a logarithm by the share `robust`.
+    """Return the mean absolute error, quadratic below 0.5 px and optionally blended with a logarithm.
 
-    The logarithmic part is 2.5 log(1 + error). Its gradient is largest for small errors, which are close to
-    counting as correct.
+    The share `robust` of each error e is replaced by 2.5 log(1 + e), whose gradient is largest for errors
+    that are close to counting as correct.
     """
     known = truth_px.isfinite()
     # Unknown truth is replaced first, because NaN times a mask is NaN, in the gradient too.
@@ -148,9 +148,8 @@ def projection_loss(
 ) -> Float[Tensor, ""]:
     """Return the mean squared difference of the left image and its reconstruction from the right image.
 
-    This is the second term of the paper's equation (5).
-
-    The mean is over all pixels of the batch whose match lies inside the right image; 0 if there are none.
+    This is the second term of the paper's equation (5). The mean is over all pixels of the batch whose match
+    lies inside the right image; 0 if there are none.
     The paper does not define the images' range and channels. Here, images are in 0..1, like the code, so that
     the weights of both terms are comparable. Channels are averaged, so that grey and colour weigh the same.
     """

@@ -68,7 +68,7 @@ def _convolution(inputs: int, outputs: int) -> tuple[nn.Module, nn.Module]:
 
 
 def _read(path: Path, expected: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Read the tensors named in `expected`, in float32. Raises FormatError if one does not fit."""
+    """Read the tensors named in `expected`, in float32. Raises FormatError if any does not match."""
     found = _load(path)
     for name, tensor in expected.items():
         shape = list(getattr(found.get(name), "shape", [])) or "nothing"

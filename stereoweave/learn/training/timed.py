@@ -1,6 +1,6 @@
 """Training for a fixed time, on a machine that is available only for short commands.
 
-While `train` counts steps, here a command ends on time. The learning rate reaches 0 when the minutes of all
+`train` counts steps; here, a command ends on time. The learning rate reaches 0 when the minutes of all
 commands are used up. Each command resumes from the files of the previous one.
 """
 

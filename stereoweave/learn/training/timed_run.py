@@ -89,7 +89,9 @@ def _read_progress(path: Path) -> RunProgress:
     try:
         return RunProgress(**json.loads(path.read_text(encoding="utf-8")))
     except (ValueError, TypeError) as error:
-        raise FormatError(f"{path}: expected the progress of a timed run, found: {error}") from error
+        raise FormatError(
+            f"{path}: expected the progress of a timed run, found other content ({error})"
+        ) from error
 
 
 def _read_optimiser(path: Path) -> dict[str, Any]:
