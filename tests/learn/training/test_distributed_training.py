@@ -70,7 +70,7 @@ def losses(run):
     return {event.step: event.value for event in events.Scalars("loss")}
 
 
-def test_two_processes_of_which_one_is_killed_end_as_one_process_does(folder, monkeypatch):
+def test_two_processes_of_which_one_is_killed_end_with_the_result_of_one_process(folder, monkeypatch):
     recipe = replace(PARTED, name="shared")
     last = folder / "shared" / "last.pt"
     process, log = torchrun(folder, recipe, "--max-restarts", "3")
@@ -108,7 +108,9 @@ def test_an_error_of_rank_0_alone_ends_all_with_its_one_line(folder):
     assert "RuntimeError" not in told
 
 
-def test_a_step_that_cannot_be_shared_out_is_refused_before_anything_is_made(tmp_path, monkeypatch):
+def test_a_step_that_cannot_be_divided_among_the_ranks_is_refused_before_anything_is_made(
+    tmp_path, monkeypatch
+):
     started = {"TORCHELASTIC_RUN_ID": "none", "RANK": "0", "WORLD_SIZE": "3", "LOCAL_WORLD_SIZE": "3"}
     for name, value in started.items():
         monkeypatch.setenv(name, value)

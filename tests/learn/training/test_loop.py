@@ -111,7 +111,7 @@ def logger(tmp_path):
         yield logger
 
 
-def test_a_run_that_is_killed_and_then_started_again_ends_as_one_that_was_not(folder, recipe_file, finished):
+def test_a_killed_and_resumed_run_ends_as_an_uninterrupted_one(folder, recipe_file, finished):
     last = folder / "killed" / "last.pt"
     code = (
         "import sys; from pathlib import Path; from stereoweave.learn.training.loop import train; "
@@ -162,7 +162,7 @@ def test_a_folder_with_a_run_of_another_recipe_is_refused(folder, finished, tmp_
     assert finished.read_bytes() == before
 
 
-def test_a_run_goes_on_with_another_end_and_other_data(folder, finished):
+def test_a_run_resumes_with_other_steps_and_other_data(folder, finished):
     recipe = replace(
         RECIPE, steps=RECIPE.steps + 2, cool_down_steps=1, mix=(("collage", 1.0),), crop_size=(32, 64)
     )
@@ -171,7 +171,7 @@ def test_a_run_goes_on_with_another_end_and_other_data(folder, finished):
     assert_same(start.optimiser, checkpoint.load(finished).optimiser)
 
 
-def test_a_run_is_kept_every_ten_minutes(folder, recipe_file, tmp_path, logger, monkeypatch):
+def test_a_run_is_saved_every_ten_minutes(folder, recipe_file, tmp_path, logger, monkeypatch):
     last = tmp_path / "last.pt"
     run = TrainingRun(RECIPE, load_start(RECIPE, last), make_fabric(logger))
     run.save_periodically(3, last)
@@ -205,7 +205,7 @@ def test_a_run_starts_from_the_averaged_weights_of_another(folder, finished):
     assert_same(start.weights, first.averaged)
 
 
-def test_a_loss_that_is_not_finite_twice_stops_and_names_the_pairs(folder, in_place, tmp_path):
+def test_a_second_loss_that_is_not_finite_stops_the_run_and_names_the_pairs(folder, in_place, tmp_path):
     broken = untrained()
     torch.nn.init.constant_(broken.to_match.weight, torch.nan)
     checkpoint.save(checkpoint_of(broken), tmp_path / "broken.pt")
@@ -260,7 +260,9 @@ def test_weights_of_another_network_are_refused_as_a_start(finished, tmp_path):
     )
 
 
-def test_a_gradient_that_is_not_finite_never_reaches_the_weights_and_twice_stops(tmp_path, logger, caplog):
+def test_gradients_that_are_not_finite_never_reach_the_weights_and_the_second_stops_the_run(
+    tmp_path, logger, caplog
+):
     recipe = recipe_of("fast_depth")
     run = TrainingRun(recipe, load_start(recipe, tmp_path / "last.pt"), make_fabric(logger))
     network = run.network
@@ -326,7 +328,7 @@ def test_every_shipped_recipe_takes_its_first_steps(recipe, tmp_path, logger):
 
 
 @pytest.mark.parametrize("model", [name for name in MODELS if not name.startswith("weave")])
-def test_any_of_the_papers_networks_trains_by_changing_one_word(model, tmp_path, logger):
+def test_each_of_the_papers_networks_trains_if_only_the_model_is_changed(model, tmp_path, logger):
     """The loss is all of equation (5) on depth with an exponent, on one batch for all networks."""
     recipe = recipe_of("fast_depth", target="depth", exponent=1.5, alpha_p=1.0, averaged_steps=1)
     run, before = step_of(replace(recipe, model=model), tmp_path, logger)
@@ -335,7 +337,7 @@ def test_any_of_the_papers_networks_trains_by_changing_one_word(model, tmp_path,
     assert_same(dict(run.averaged.module.state_dict()), dict(run.network.state_dict()))
 
 
-def test_a_code_network_that_is_resumed_ends_as_one_that_was_not(folder, in_place):
+def test_a_resumed_code_network_ends_as_an_uninterrupted_one(folder, in_place):
     """This includes dropout, whose random draws continue."""
     recipe = recipe_of("fast_depth", name="paper", steps=4, alpha_p=1.0)
     whole = checkpoint.load(training.train_recipe(recipe, folder / "paper", QUIET))
@@ -367,7 +369,7 @@ def test_the_scores_of_a_run_are_recorded_step_by_step(folder, finished):
     assert rows[-1] == {"step": RECIPE.steps, **checkpoint.load(finished).scores}
 
 
-def test_a_record_that_is_written_again_replaces_what_came_later(tmp_path):
+def test_scores_written_again_replace_those_of_later_steps(tmp_path):
     for step, score in ((10, 3.0), (20, 2.0), (30, 1.0), (20, 2.5)):
         training.append_scores(tmp_path / "curve.csv", step, {"loss": score})
     rows = training.read_scores(tmp_path / "curve.csv")

@@ -105,7 +105,7 @@ def test_a_depth_moves_the_pixels_of_each_sample_by_its_own_disparity():
 
 
 @pytest.mark.parametrize(("value_px", "depth_m"), [(1.0, 4.0), (0.5, 8.0), (0.0, 16.0), (-3.0, 64.0)])
-def test_pixels_beyond_the_greatest_depth_go_on_along_the_tangent(value_px, depth_m):
+def test_pixels_beyond_the_greatest_depth_continue_along_the_tangent(value_px, depth_m):
     """A network whose first outputs are near 0 px, or behind the camera, gets a gradient to the truth."""
     # f B = 4 px m: 8 m at 0.5 px, where depth falls by 16 m per pixel.
     batch, network = batch_of([[1.0, 2.0, torch.nan]], [4.0], [0.0]), Constant("disparity_px", value_px)
@@ -128,7 +128,7 @@ def test_without_a_weight_there_is_no_projection():
     assert losses.keys() == {"prediction"}
 
 
-def test_every_output_counts_as_much_as_its_weight_says():
+def test_outputs_are_weighted():
     # The second output is 0 px: codes of 0, errors of 1/4 and 1; nothing moves: columns read 0, 0 and 1.
     network = Constant("disparity_px", 1.0, 0.0, output_weights=(0.5, 2.0))
     losses = losses_of(DISPARITY, network, batch_of(TRUTH_PX))
@@ -184,7 +184,7 @@ def test_code_quantity_and_disparity_agree(recipe):
         )
 
 
-def test_a_depth_of_just_the_greatest_passes_and_one_beyond_is_refused():
+def test_the_greatest_depth_is_accepted_and_one_beyond_is_refused():
     # 5.4 px m / 0.9 px is 6 m, and in float32 a little more; 5.4 / 1.8 is 3 m, the code (1/2)^2.
     assert torch.tensor(5.4) / torch.tensor(0.9) > 6
     recipe = replace(DEPTH, max_depth_m=6.0)

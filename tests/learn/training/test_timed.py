@@ -96,7 +96,7 @@ def test_a_clock_counts_the_commands_before_and_ends_a_command_in_time():
     assert late.elapsed_share(2000) == 1
 
 
-def test_a_pair_comes_as_often_as_it_is_to_be_cut():
+def test_a_pair_is_reused_for_the_given_number_of_cuts():
     sample = box_before_a_wall(np.random.default_rng(0))
     samples = [replace(sample) for _ in range(5000)]
     fresh, reused = (ReusedPairs(Listed(samples), held=10) for _ in range(2))
@@ -242,7 +242,7 @@ def dataset(folder):
     return file
 
 
-def test_painters_go_on_when_one_of_them_is_killed(tmp_path):
+def test_painters_continue_when_one_of_them_is_killed(tmp_path):
     recipe = read_recipe(dataset(tmp_path))
     with Painters([recipe, make_cool_down_recipe(recipe, (16, 32))], tmp_path, processes=2) as painters:
         first = painters.take()
@@ -319,7 +319,7 @@ def test_a_second_step_in_500_that_is_not_finite_ends_the_run(tmp_path, monkeypa
     assert "step 0: the loss or its gradient is not finite; skipped" in lines
 
 
-def test_training_by_the_clock_does_without_what_a_lent_machine_may_lack():
+def test_training_by_the_clock_runs_without_optional_libraries():
     left_out = [
         "lightning_fabric",
         "tensorboard",
