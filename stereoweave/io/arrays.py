@@ -8,28 +8,28 @@ from stereoweave.arguments import is_plain_array
 from stereoweave.errors import StereoweaveError
 
 _CHANNELS = (1, 3, 4)
-# Tolerance beyond 0..1: less than half a level, so that it rounds to 0 or 255.
+# Tolerance beyond 0..1: less than half a level, so that such a value still rounds to 0 or 255.
 _FORGIVEN = 0.4 / 255
 # Modes that Pillow cannot convert to RGB in one step.
 _BETWEEN = {"La": "LA", "RGBa": "RGBA"}
 
 
 def as_rgb(image: object, name: str = "image") -> UInt8[np.ndarray, "h w 3"]:
-    """Convert an image to contiguous uint8 RGB [H, W, 3]; an array that is one already is returned itself.
+    """Convert an image to contiguous uint8 RGB [H, W, 3]; an array already in this form is not copied.
 
-    Grey is repeated, alpha dropped, 16 bits are reduced to the upper 8, and floats in 0..1 are scaled and
-    rounded. Channels (1, 3 or 4) are the last axis if its length fits, else the first; so [3, W, 3] is 3 rows
-    of W pixels. A leading axis of length 1, a batch of one image, is dropped.
+    Grey is repeated in all three channels, alpha is dropped, 16-bit values are reduced to their upper 8 bits,
+    and floats in 0..1 are scaled and rounded. The channels are the last axis if its length is 1, 3 or 4, else
+    the first; so [3, W, 3] is 3 rows of W pixels. A batch of one image loses its leading axis.
 
-    Channels are taken as RGB: reverse images of OpenCV, which are BGR, with `image[..., ::-1]` first. The
-    EXIF orientation of a PIL image is ignored: apply `PIL.ImageOps.exif_transpose` first.
+    Channels are taken to be RGB: reverse OpenCV's BGR images with `image[..., ::-1]` first. The EXIF
+    orientation of a PIL image is ignored: apply `PIL.ImageOps.exif_transpose` first.
 
     Args:
         image: NumPy array, PIL image of any colour mode, or PyTorch tensor on any device.
         name: Name of the image in errors.
 
     Raises:
-        StereoweaveError: if type, shape or dtype is unsupported, or a float is outside of 0..1.
+        StereoweaveError: if the type, shape or dtype is unsupported, or a float is outside 0..1.
     """
     if isinstance(image, Image.Image):
         image = _convert_pil(image)
@@ -42,7 +42,7 @@ def as_rgb(image: object, name: str = "image") -> UInt8[np.ndarray, "h w 3"]:
     if not is_plain_array(image):
         raise StereoweaveError(
             f"{name}: expected a NumPy array, a PIL image or a torch tensor, got {type(image).__name__}; "
-            "PIL.Image.open reads a file"
+            "open a file with PIL.Image.open"
         )
     levels = _move_channels_last(_to_eight_bits(image, name), name)
     match levels.shape[2]:
@@ -60,7 +60,7 @@ def _convert_pil(picture: Image.Image) -> Shaped[np.ndarray, "h w *channels"]:
         return np.array(direct.convert("RGB"))
     values = np.asarray(picture)
     if picture.mode == "I" and values.size and values.min() >= 0 and values.max() <= 65535:
-        # Mode I has 32 bits; files store 16 or 8 in it. `io.read_image` converts it the same way.
+        # Mode I has 32 bits, but holds the 16-bit or 8-bit values of files; `io.read_image` does the same.
         return values.astype(np.uint16 if values.max() > 255 else np.uint8)
     return values
 
@@ -73,13 +73,14 @@ def _to_eight_bits(values: Shaped[np.ndarray, "..."], name: str) -> UInt8[np.nda
     got = f"{values.dtype} {list(values.shape)}"
     if values.dtype.kind != "f":
         raise StereoweaveError(
-            f"{name}: expected uint8, uint16 or a float in 0..1, got {got}; convert 0..255 by astype('uint8')"
+            f"{name}: expected uint8, uint16 or floats in 0..1, got {got}; "
+            "convert values in 0..255 with astype('uint8')"
         )
-    # The opposite comparison would accept NaN; the product below may overflow, so it comes later.
+    # The negated condition also rejects NaN. It precedes the product below, which may overflow.
     if not ((values >= -_FORGIVEN) & (values <= 1 + _FORGIVEN)).all():
         raise StereoweaveError(
-            f"{name}: expected floats in 0..1, got {got} of {values.min():g} to {values.max():g}; "
-            "divide 0..255 by 255, and fill NaN"
+            f"{name}: expected floats in 0..1, got {got} from {values.min():g} to {values.max():g}; "
+            "divide values in 0..255 by 255, and replace NaN"
         )
     return np.rint(values * 255.0).astype(np.uint8)
 
@@ -93,6 +94,6 @@ def _move_channels_last(levels: UInt8[np.ndarray, "..."], name: str) -> UInt8[np
     if picture.ndim == 3 and picture.shape[0] in _CHANNELS:
         return np.moveaxis(picture, 0, 2)
     raise StereoweaveError(
-        f"{name}: expected one image, [H, W], [H, W, 3], [H, W, 4] or [3, H, W], got "
+        f"{name}: expected one image of shape [H, W], [H, W, 3], [H, W, 4] or [3, H, W], got "
         f"{list(levels.shape)}; pass one image at a time, channels last"
     )

@@ -9,9 +9,9 @@ OCCLUDED_RGB = (217, 72, 15)
 
 
 def find_colour_range_px(disparity_px: Float[np.ndarray, "h w"]) -> tuple[float, float]:
-    """Disparities (px) of the first and the last colour.
+    """Return the disparities, in px, of the first and the last colour.
 
-    Half a percent at either end is ignored, so that a few outliers do not reduce the contrast.
+    The lowest and the highest half percent are ignored, so that a few outliers do not reduce the contrast.
     """
     low_px, high_px = np.percentile(disparity_px, [_OUTLIERS_PERCENT, 100 - _OUTLIERS_PERCENT])
     return float(low_px), max(float(high_px), float(low_px) + 1.0)
@@ -20,7 +20,7 @@ def find_colour_range_px(disparity_px: Float[np.ndarray, "h w"]) -> tuple[float,
 def colour_disparity(
     disparity_px: Float[np.ndarray, "h w"], range_px: tuple[float, float]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Disparity as an RGB image [H, W, 3]: blue is the low end of `range_px` (far), red the high end."""
+    """Return disparity as an RGB image [H, W, 3], from blue (the low end of `range_px`, far) to red."""
     low_px, high_px = range_px
     share = (disparity_px - low_px) / (high_px - low_px)
     levels = np.round(np.clip(share, 0, 1) * 255).astype(np.uint8)
@@ -28,25 +28,25 @@ def colour_disparity(
 
 
 def grey_confidence(confidence: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
-    """Confidence in 0..1 as a grey image [H, W]: black is 0, white is 1."""
+    """Return confidence in 0..1 as a grey image [H, W]: 0 is black, 1 is white."""
     return np.round(confidence * 255).astype(np.uint8)
 
 
 def colour_confidence(
     confidence: Float[np.ndarray, "h w"], occluded: Bool[np.ndarray, "h w"]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Confidence as an RGB image [H, W, 3] in grey, with occluded pixels in orange."""
+    """Return confidence as an RGB image [H, W, 3] in shades of grey, with occluded pixels in orange."""
     picture = np.repeat(grey_confidence(confidence)[..., None], 3, axis=2)
     picture[occluded] = OCCLUDED_RGB
     return picture
 
 
 def legend_colours(count: int) -> list[str]:
-    """`count` evenly spaced CSS colours, from the low end of the disparity colours to the high end."""
+    """Return `count` evenly spaced CSS colours, from the low end of the disparity colours to the high end."""
     ramp = colour_disparity(np.linspace(0, 1, count, dtype=np.float32)[None], (0.0, 1.0))[0]
     return [css_colour(tuple(rgb)) for rgb in ramp.tolist()]
 
 
 def css_colour(rgb: tuple[int, ...]) -> str:
-    """CSS notation of a colour."""
+    """Return the CSS notation of an RGB colour."""
     return "rgb({},{},{})".format(*rgb)

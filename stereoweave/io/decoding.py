@@ -1,7 +1,7 @@
-"""The only decoder of pictures: decodes a file with its metadata, or refuses it by name.
+"""Decoding of picture files with their metadata.
 
-Commands, Python, video, boards, benchmarks, datasets, the page and the service all use it, so that they share
-formats, limits, colours, orientation and errors.
+All parts of the package decode pictures here, so that formats, limits, colours, orientation and errors are
+the same everywhere.
 """
 
 import io
@@ -21,15 +21,15 @@ from stereoweave.errors import FormatError, reason
 from stereoweave.io import exif
 from stereoweave.stereo import LONGEST_SIDE_PX
 
-# 50 megapixels per view are supported; cameras of that class have up to 64. Checked on the file's header,
-# before memory is allocated.
+# 50 megapixels per view are supported; cameras of that class have up to 64. The limit is checked against the
+# file's header, before memory is allocated.
 MOST_PIXELS = 65_000_000
 A_PICTURE = "a picture (PNG, JPEG, TIFF or the like)"
 # File name endings for finding pictures in a folder; the format of a file is detected from its content.
 ENDINGS = frozenset(
     {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp", ".gif", ".jp2", ".pgm", ".ppm", ".avif"}
 )
-# Not every format of Pillow's: PostScript, for example, would run as a program. JPEG includes MPO and JPS.
+# Not all of Pillow's formats: PostScript, for example, would run as a program. JPEG includes MPO and JPS.
 _KINDS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "GIF", "PPM", "AVIF", "JPEG2000")
 _RAW_ENDINGS = {
     *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dng", ".erf", ".iiq", ".kdc", ".mrw", ".nef", ".nrw", ".orf"),
@@ -40,7 +40,7 @@ _HEIF_BRANDS = {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b
 _AVIF_BRANDS = {b"avif", b"avis"}
 _MP_ENTRIES, _DISPARITY = 0xB002, "Multi-Frame Image: (Disparity)"
 _LONGEST_WORDS = 100
-# Colour space of a mode to which an ICC profile may apply.
+# The mode to which a picture is converted before its ICC profile is applied, by the picture's own mode.
 _PROFILED = {"RGB": "RGB", "RGBA": "RGB", "P": "RGB", "L": "L", "LA": "L", "CMYK": "CMYK"}
 
 # Pillow logs errors before raising them, and Python writes unhandled log records to stderr.
@@ -48,24 +48,24 @@ logging.getLogger("PIL").addHandler(logging.NullHandler())
 
 
 class DecodedPicture(NamedTuple):
-    """A decoded picture in sRGB, not yet upright, with its metadata tags and a note on its colours."""
+    """A decoded picture in sRGB, not yet turned upright, with its metadata tags and a note on its colours."""
 
     image: Image.Image
     tags: exif.Tags
     note: str | None
 
     def upright(self, lies: int | None) -> UInt8[np.ndarray, "h w 3"]:
-        """Pixels turned upright from an EXIF orientation, uint8 RGB [H, W, 3]."""
+        """Return the pixels, uint8 RGB [H, W, 3], turned upright according to the EXIF orientation `lies`."""
         # A copy: Pillow's read-only pixels would make Numba compile again and PyTorch warn.
         return np.array(exif.turn_upright(self.image, lies))
 
 
 @contextmanager
 def open_picture(path: Path, *, views: int = 1, expected: str = A_PICTURE) -> Iterator[Image.Image]:
-    """Open a picture of one or two views, of a supported format and size, without decoding it.
+    """Open a picture with up to `views` views and check its format and size, without decoding it.
 
     Raises:
-        FormatError: if format or size are unsupported; decoding raises one if the content is damaged.
+        FormatError: if the format or the size is unsupported. Damaged content is detected by decoding.
     """
     check_regular(path, expected)
     with _decoding(path, expected), path.open("rb") as file:
@@ -80,7 +80,7 @@ def open_picture(path: Path, *, views: int = 1, expected: str = A_PICTURE) -> It
 
 
 def read_picture(path: Path) -> DecodedPicture:
-    """Decode a file that holds one view."""
+    """Decode a picture file that holds one view."""
     with open_picture(path) as picture:
         return decode(path, picture)
 
@@ -106,7 +106,7 @@ def decode_values(path: str | Path, picture: Image.Image) -> Shaped[np.ndarray, 
 
 
 def decode_packed_values(name: str, content: bytes) -> Shaped[np.ndarray, "h w *channels"]:
-    """Decode the stored values of a picture within another file; errors call it `name`."""
+    """Decode the stored values of a picture embedded in another file; errors call it `name`."""
     with _decoding(name):
         picture = _open(name, io.BytesIO(content), 1)
     check_size(name, picture.size)
@@ -142,9 +142,9 @@ def check_size(path: str | Path, size_px: tuple[int, int], *, views: int = 1) ->
 def _decoding(path: str | Path, expected: str = A_PICTURE) -> Iterator[None]:
     """Turn any exception of Pillow into a one-line FormatError.
 
-    Only for calls of Pillow. Its decoders raise undocumented exceptions for damaged files, such as
-    IndexError, KeyError, TypeError, struct.error and zlib.error; a list would never be complete. Code of this
-    package stays outside: its bugs must not be reported as damaged files.
+    Pillow's decoders raise undocumented exceptions for damaged files, such as IndexError, KeyError,
+    TypeError, struct.error and zlib.error; a list would never be complete. Wrap calls to Pillow only: bugs in
+    this package must not be reported as damaged files.
     """
     try:
         # Pillow warns about odd tags before it fails; the error below is enough.
@@ -176,36 +176,39 @@ def _refuse_by_name(path: Path, head: bytes) -> None:
     ending = path.suffix.lower()
     if ending in _RAW_ENDINGS:
         raise FormatError(
-            f"{path}: expected {A_PICTURE}, found a camera's raw file; develop it to one of these first"
+            f"{path}: expected {A_PICTURE}, found a camera's raw file; convert it to one of these first"
         )
     brands = {head[start : start + 4] for start in (8, *range(16, 64, 4))} if head[4:8] == b"ftyp" else set()
     if brands & _AVIF_BRANDS:
         if not features.check("avif"):
-            raise FormatError(f"{path}: expected {A_PICTURE}, found AVIF, which this Pillow does not read")
+            raise FormatError(
+                f"{path}: expected {A_PICTURE}, found AVIF, which the installed Pillow cannot read"
+            )
     elif brands & _HEIF_BRANDS:
         raise FormatError(
-            f"{path}: expected {A_PICTURE}, found HEIC, such as a spatial photograph, which is unsupported; "
-            "export it as two JPEG files, or as one with both views side by side"
+            f"{path}: expected {A_PICTURE}, found HEIC, the format of spatial photographs, "
+            "which is unsupported; export it as two JPEG files, or as one with both views side by side"
         )
     elif brands or ending in _VIDEO_ENDINGS:
-        raise FormatError(f"{path}: expected {A_PICTURE}, found a video; 'stereoweave video' takes those")
+        raise FormatError(f"{path}: expected {A_PICTURE}, found a video; 'stereoweave video' reads videos")
 
 
 def _refuse_by_content(path: Path, picture: Any) -> None:
-    """Raise a FormatError for a panorama, VR180 or an animation."""
+    """Raise a FormatError for a panorama, a VR180 picture or an animation."""
     description = picture.info.get("xmp", b"")
     words = description if isinstance(description, bytes) else str(description).encode(errors="replace")
     if b"GImage:" in words or b"equirectangular" in words.lower():
         raise FormatError(
-            f"{path}: expected a plain photograph, found a VR180 picture or a 360-degree panorama "
-            "(from its XMP metadata); export two plain views from it"
+            f"{path}: expected an ordinary picture, found a VR180 picture or a 360-degree panorama "
+            "(according to its XMP metadata); export two ordinary views from it"
         )
     if picture.format in ("GIF", "PNG", "WEBP", "AVIF"):
         with _decoding(path):
             count = picture.n_frames
         if count > 1:
             raise FormatError(
-                f"{path}: expected one picture, found an animation of {count}; save its two views"
+                f"{path}: expected one picture, found an animation of {count} frames; "
+                "save its two views as pictures"
             )
 
 
@@ -218,13 +221,13 @@ def _to_eight_bits(path: Path, picture: Image.Image) -> Image.Image:
             f"{path}: expected {A_PICTURE}, found one that cannot be read (more than 16 bits a channel or "
             f"values below 0, mode {picture.mode})"
         )
-    # The upper byte, as Pillow converts 16-bit colour; a 32-bit file may hold 8-bit values.
+    # Keep the upper byte, as Pillow does for 16-bit colour; a 32-bit file may hold 8-bit values.
     bits = 8 if picture.mode != "I" or values.max() > 255 else 0
     return Image.fromarray((values >> bits).astype(np.uint8)).convert("RGB")
 
 
 def _convert_to_srgb(picture: Image.Image) -> tuple[Image.Image, str | None]:
-    """Convert a picture to sRGB; also returns a note if it has another colour profile, or a damaged one."""
+    """Convert a picture to sRGB. Returns it and a note if it had another or a damaged colour profile."""
     profile, mode = picture.info.get("icc_profile"), _PROFILED.get(picture.mode)
     if not profile or mode is None:
         return picture, None
@@ -243,21 +246,21 @@ def _convert_to_srgb(picture: Image.Image) -> tuple[Image.Image, str | None]:
             outputMode="RGB",
             flags=ImageCms.Flags.BLACKPOINTCOMPENSATION,
         )
-    except Exception as error:  # of any type for a damaged profile, as in `_decoding`
+    except Exception as error:  # a damaged profile may raise any type, as in `_decoding`
         return (
             picture,
-            f"the colour profile cannot be used, colours are taken as sRGB ({_clean_text(str(error))})",
+            f"the colour profile cannot be used, so colours are taken to be sRGB ({_clean_text(str(error))})",
         )
     return converted or picture, f"colours converted from {name}"
 
 
 def _clean_text(text: str) -> str:
-    """Text from a file, safe to show within a line."""
+    """Return text from a file in a form that is safe to show within a line."""
     return "".join(filter(str.isprintable, " ".join(text.split())))[:_LONGEST_WORDS]
 
 
 def find_view_frames(path: Path, picture: Any) -> list[int]:
-    """Indices of an MPO file's two frames that are its views; none if it has one view and previews."""
+    """Return the indices of the two frames of an MPO file that are its views; empty if it has one view."""
     if picture.format != "MPO":
         return []
     with _decoding(path):
@@ -284,7 +287,7 @@ def read_frame(path: Path, picture: Image.Image, index: int) -> DecodedPicture:
 
 
 def _seek(path: Path, picture: Image.Image, index: int) -> None:
-    """Go to a frame of an MPO file, without keeping the tags and the profile of the previous frame."""
+    """Seek to a frame of an MPO file and drop the tags and the profile of the previous frame."""
     if picture.tell() == index:
         return
     for key in ("mp", "icc_profile"):
@@ -292,7 +295,7 @@ def _seek(path: Path, picture: Image.Image, index: int) -> None:
     try:
         with warnings.catch_warnings(action="ignore"):
             picture.seek(index)
-    except Exception as error:  # of any type for a damaged file, as in `_decoding`
+    except Exception as error:  # a damaged file may raise any type, as in `_decoding`
         raise FormatError(
             f"{path}: expected an undamaged MPO file, found picture {index + 1} truncated or damaged "
             f"({_clean_text(str(error))})"

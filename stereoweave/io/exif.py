@@ -1,4 +1,4 @@
-"""Metadata of pictures: orientation, focal length and baseline, from EXIF and the Multi-Picture Format."""
+"""Picture metadata: orientation, focal length and baseline, from EXIF and the Multi-Picture Format."""
 
 import io
 import math
@@ -13,16 +13,16 @@ from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 from stereoweave.errors import StereoweaveError
 
-# Values by tag number, of EXIF and of CIPA DC-007, the Multi-Picture Format.
+# Values by tag number, from EXIF and from CIPA DC-007, the Multi-Picture Format.
 Tags = Mapping[int, Any]
 _VIEWPOINT, _BASELINE = 0xB101, 0xB206
 _UNKNOWN = 0xFFFFFFFF
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 # CIPA DCG-001: a "35 mm film" focal length has the same diagonal angle of view on 36 mm x 24 mm.
 _FILM_DIAGONAL_MM = math.hypot(36, 24)
-# Plausible focal lengths in view diagonals: a fisheye lens has 0.15 or more, a telescope up to 50.
+# Plausible focal lengths, in view diagonals: a fisheye lens has at least 0.15, a telescope up to 50.
 _SHORTEST, _LONGEST = 0.1, 100
-# Baselines of 3-D cameras that do not store it, from the makers' data sheets.
+# Baselines of 3-D cameras that do not store them, from the makers' data sheets.
 _BASELINES_M = {"FinePix REAL 3D W1": 0.077, "FinePix REAL 3D W3": 0.075, "Nintendo 3DS": 0.035}
 _TURNS = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
@@ -54,33 +54,33 @@ class Lens:
 
 
 def read_tags(picture: Image.Image) -> Tags:
-    """Read the tags of an opened picture, or of an MPO file's current frame, without damaged ones."""
+    """Read the tags of an opened picture, or of an MPO file's current frame; damaged tags are left out."""
     # Pillow warns about each damaged tag.
     with warnings.catch_warnings(action="ignore"):
         return _read_exif_tags(picture) | _read_multi_picture_tags(picture.info.get("mp", b""))
 
 
 def read_orientation(tags: Tags) -> int | None:
-    """EXIF orientation, 1 (upright) to 8; None if missing or invalid."""
+    """Return the EXIF orientation, from 1 (upright) to 8; None if missing or invalid."""
     value = tags.get(Base.Orientation)
     return value if value in (1, *_TURNS) else None
 
 
 def turn_upright(picture: Image.Image, lies: int | None) -> Image.Image:
-    """Turn a picture upright from an EXIF orientation, which may be another picture's."""
+    """Turn a picture upright according to an EXIF orientation, which may come from another picture."""
     return picture.transpose(_TURNS[lies]) if lies in _TURNS else picture
 
 
 def read_viewpoint(tags: Tags) -> int:
-    """Viewpoint number of an MPO file's frame, counted from the left; 0 if missing."""
+    """Return the viewpoint number of an MPO file's frame, counted from the left; 0 if missing."""
     value = tags.get(_VIEWPOINT)
     return value if isinstance(value, int) else 0
 
 
 def read_lens(tags: Tags, width_px: int, height_px: int) -> Lens | None:
-    """Focal length and baseline for views of this size; None if the tags have neither.
+    """Return the focal length and the baseline for views of this size; None if the tags have neither.
 
-    The views must show the camera's full image, at any scale: a crop would get a wrong focal length.
+    The views must show the camera's full image, at any scale: for a crop, the focal length would be wrong.
     """
     lens = Lens(focal_px=_find_focal_px(tags, width_px, height_px), baseline_m=_find_baseline_m(tags))
     return None if lens == Lens() else lens
@@ -90,12 +90,12 @@ def _read_exif_tags(picture: Image.Image) -> dict[int, Any]:
     try:
         tags = picture.getexif()
         return dict(tags) | dict(tags.get_ifd(IFD.Exif))
-    except Exception:  # of any type for damaged tags, see `decoding._decoding`
+    except Exception:  # damaged tags may raise any type, as in `decoding._decoding`
         return {}
 
 
 def _read_multi_picture_tags(content: bytes) -> dict[int, Any]:
-    """Tags of an MPO file's frame: its own, and for the first frame the file's."""
+    """Read the tags of an MPO file's frame: its own tags and, in the first frame, the file's tags too."""
     tags: dict[int, Any] = {}
     try:
         directory = ImageFileDirectory_v2(content[:8])
@@ -105,7 +105,7 @@ def _read_multi_picture_tags(content: bytes) -> dict[int, Any]:
                 file.seek(directory.next)
                 directory.load(file)
                 tags |= dict(directory)
-    except Exception:  # of any type for damaged tags
+    except Exception:  # damaged tags may raise any type
         return tags
     if getattr(tags.get(_BASELINE), "numerator", _UNKNOWN) == _UNKNOWN:
         tags.pop(_BASELINE, None)
@@ -144,7 +144,7 @@ def _find_baseline_m(tags: Tags) -> float | None:
 
 
 def _parse_positive(value: Any) -> float | None:
-    """Positive number of a tag; None for 0, which means unknown, and for an invalid value."""
+    """Return a tag's value if it is a positive number; None if it is 0, which means unknown, or invalid."""
     try:
         number = float(value)
     except (TypeError, ValueError, ZeroDivisionError):

@@ -1,4 +1,4 @@
-"""Atomic writing of files, and errors of reading them."""
+"""Atomic writing of files, and one-line errors for files that cannot be read or written."""
 
 import re
 import stat
@@ -12,10 +12,10 @@ from stereoweave.errors import FormatError, StereoweaveError, reason
 
 # Real calibrations and training recipes have a few kilobytes.
 MOST_SMALL_BYTES = 256 * 1024
-# Temporary names of `replacing`.
+# Names of the temporary files of `replacing`.
 _TEMPORARY = re.compile(r"\..*-[0-9a-f]{8}(\.\w+)?")
-# Errors that libraries raise for damaged files: OverflowError for infinite sizes, RuntimeError (its
-# RecursionError) for deep JSON.
+# Errors that libraries raise for damaged files: OverflowError for infinite sizes, RuntimeError (as
+# RecursionError) for deeply nested JSON.
 _UNREADABLE = OSError, ValueError, OverflowError, SyntaxError, RuntimeError
 
 
@@ -23,12 +23,14 @@ def read_small(path: str | Path) -> bytes:
     """Read a regular file of at most 256 KB, such as a calibration.
 
     Raises:
-        FormatError: The file is larger, or a pipe or a device, which may be endless.
+        FormatError: The file is larger, or it is a pipe or a device, which may be endless.
         OSError: The file cannot be read; `reading` turns this into a FormatError.
     """
     mode = Path(path).stat().st_mode
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):  # opening a folder fails with its own error
-        raise FormatError(f"{path}: expected a regular file, found a pipe or a device; save it to a file")
+        raise FormatError(
+            f"{path}: expected a regular file, found a pipe or a device; save its content to a file"
+        )
     with Path(path).open("rb") as file:
         content = file.read(MOST_SMALL_BYTES + 1)
     if len(content) > MOST_SMALL_BYTES:
@@ -37,7 +39,7 @@ def read_small(path: str | Path) -> bytes:
 
 
 def make_folder(path: str | Path) -> Path:
-    """Make a folder and check that it is writable, so that a long run does not fail at its end."""
+    """Make a folder and check at once that it is writable, so that a long run does not fail at its end."""
     folder = Path(path)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -50,9 +52,10 @@ def make_folder(path: str | Path) -> Path:
 
 
 def make_parent_folder(*files: Path) -> Path:
-    """Check that files of one folder can be written; raises StereoweaveError otherwise.
+    """Check that files in one folder can be written. Returns the nearest existing parent folder.
 
-    Returns the nearest existing parent folder, which is checked in place of missing ones.
+    That parent is checked in place of folders that do not exist yet. Raises StereoweaveError if a file cannot
+    be written.
     """
     for file in files:
         if file.is_dir():
@@ -63,7 +66,7 @@ def make_parent_folder(*files: Path) -> Path:
 
 @contextmanager
 def reading(path: str | Path, expected: str) -> Iterator[None]:
-    """Turn errors of reading `path` into a one-line FormatError: expected, found."""
+    """Turn errors raised while reading `path` into a one-line FormatError: "expected ..., found ..."."""
     try:
         yield
     except FormatError:
@@ -74,9 +77,10 @@ def reading(path: str | Path, expected: str) -> Iterator[None]:
 
 @contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
-    """Write a file atomically: yields a temporary name, which replaces `path` at the end.
+    """Write a file atomically: yield a temporary path, whose file replaces `path` at the end.
 
-    The temporary name is beside `path`, has its ending, and is removed on an error. Missing folders are made.
+    The temporary file is in the folder of `path`, has the same ending, and is removed after an error. Missing
+    folders are made.
 
     Raises:
         StereoweaveError: The folder or the file cannot be written.
@@ -95,11 +99,14 @@ def replacing(path: str | Path) -> Iterator[Path]:
 
 
 def is_leftover(path: Path) -> bool:
-    """Whether a file is a temporary one of `replacing` that a killed program left."""
+    """Return whether a file has the name of a temporary file of `replacing`, left by a killed program."""
     return _TEMPORARY.fullmatch(path.name) is not None
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove temporary files that killed programs left in a folder and below; nobody may be writing there."""
+    """Remove the temporary files that killed programs left in a folder and its subfolders.
+
+    No other program may be writing to the folder.
+    """
     for path in filter(is_leftover, folder.rglob(".*")):
         path.unlink(missing_ok=True)

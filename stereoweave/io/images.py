@@ -27,14 +27,14 @@ _KINDS = {
 
 
 def read_image(path: str | Path) -> UInt8[np.ndarray, "h w 3"]:
-    """Read a picture as uint8 sRGB [H, W, 3], rotated by its EXIF orientation.
+    """Read a picture as uint8 sRGB [H, W, 3], turned upright according to its EXIF orientation.
 
-    Colour profiles are applied, grey becomes RGB, alpha is dropped, and 16 bits are reduced to 8. An MPO file
-    gives its first picture.
+    Colour profiles are applied, grey becomes RGB, alpha is dropped, and 16 bits are reduced to 8. Of an MPO
+    file, the first picture is read.
 
     Raises:
-        FormatError: The file is missing, truncated, animated or of an unsupported kind; or the picture is
-            under 32 pixels or over 32,766 pixels wide or high, or over 65 megapixels.
+        FormatError: The file is missing, truncated, animated or of an unsupported format. Or the picture has
+            a side of less than 32 or more than 32,766 pixels, or more than 65 megapixels.
     """
     decoded = read_picture(Path(path))
     image = decoded.upright(read_orientation(decoded.tags))
@@ -43,7 +43,7 @@ def read_image(path: str | Path) -> UInt8[np.ndarray, "h w 3"]:
 
 
 def check_large_enough(path: str | Path, image: UInt8[np.ndarray, "h w 3"]) -> None:
-    """Raise a FormatError if a view is under 32 pixels wide or high."""
+    """Raise a FormatError if a view is less than 32 pixels wide or high."""
     if min(image.shape[:2]) < SMALLEST_SIDE_PX:
         raise FormatError(
             f"{path}: expected at least {SMALLEST_SIDE_PX}x{SMALLEST_SIDE_PX} pixels, "
@@ -52,7 +52,7 @@ def check_large_enough(path: str | Path, image: UInt8[np.ndarray, "h w 3"]) -> N
 
 
 def read_pair(left: str | Path, right: str | Path) -> StereoPair:
-    """Read a pair; raises FormatError as `read_image` does, or if the sizes differ."""
+    """Read a pair. Raises FormatError as `read_image` does, and if the sizes differ."""
     return make_pair(left, read_image(left), right, read_image(right))
 
 
@@ -62,7 +62,7 @@ def make_pair(
     right: str | Path,
     right_image: UInt8[np.ndarray, "h2 w2 3"],
 ) -> StereoPair:
-    """Make a pair of two named images; raises FormatError if one is too small or the sizes differ."""
+    """Make a pair from two named images. Raises FormatError if one is too small or their sizes differ."""
     for path, image in ((left, left_image), (right, right_image)):
         check_large_enough(path, image)
     if left_image.shape != right_image.shape:
@@ -74,16 +74,16 @@ def make_pair(
 
 
 def write_image(path: str | Path, image: UInt8[np.ndarray, "h w 3"] | UInt8[np.ndarray, "h w"]) -> None:
-    """Write an RGB or grey image; the file name's ending sets the format, such as .png or .jpg."""
+    """Write an RGB or grey image; the file name's ending, such as .png, determines the format."""
     save_picture(path, image, picture_kind(path))
 
 
 def picture_kind(path: str | Path) -> str:
-    """Return Pillow's format name for the ending of `path`; raises StereoweaveError for an unknown one."""
+    """Return Pillow's format name for the ending of `path`. Raises StereoweaveError for an unknown ending."""
     ending = Path(path).suffix
     if ending.lower() not in _KINDS:
         raise StereoweaveError(
-            f"{path}: expected a picture file ending, {', '.join(_KINDS)}, found {ending!r}"
+            f"{path}: expected a picture file ending ({', '.join(_KINDS)}), found {ending!r}"
         )
     return _KINDS[ending.lower()]
 
@@ -91,9 +91,9 @@ def picture_kind(path: str | Path) -> str:
 def save_picture(
     path: str | Path, values: UInt8[np.ndarray, "h w *channels"] | UInt16[np.ndarray, "h w"], kind: str
 ) -> None:
-    """Write values as a picture of one of Pillow's formats."""
+    """Write values as a picture; `kind` is Pillow's name of the format."""
     with replacing(path) as temporary, checking_format_size(path, values.shape):
-        # Level 3 takes a third of the time of Pillow's 6, for 5 % more bytes (a picture of 741x500).
+        # Level 3 takes a third of the time of Pillow's default of 6, for 5 % more bytes (at 741x500 px).
         Image.fromarray(values).save(temporary, kind, quality=95, compress_level=3)
 
 
@@ -105,7 +105,7 @@ def checking_format_size(path: str | Path, shape: tuple[int, ...]) -> Iterator[N
     except ValueError as error:
         raise StereoweaveError(
             f"{path}: expected a size that {Path(path).suffix} supports, found {shape[1]}x{shape[0]} px "
-            f"({error}); .png supports any"
+            f"({error}); use .png, which supports any size"
         ) from error
 
 

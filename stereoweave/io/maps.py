@@ -14,7 +14,7 @@ from stereoweave.io.decoding import check_regular, check_size, decode_values, op
 from stereoweave.io.files import reading, replacing
 from stereoweave.io.images import checking_format_size, save_picture
 
-# Digits are limited, because Python cannot print an integer of 4,301 digits.
+# The number of digits is limited, because Python cannot print an integer of 4,301 digits.
 _PFM_HEADER = re.compile(rb"Pf\s+(\d{1,9})\s+(\d{1,9})\s+(\S{1,99})\s")
 _LONGEST_PFM_HEADER = 256
 
@@ -26,11 +26,13 @@ class RangeError(StereoweaveError):
 def read_pfm(path: str | Path) -> Float32[np.ndarray, "h w"]:
     """Read a single-channel PFM file of either byte order, top row first.
 
-    Source: Middlebury's variant of the format: rows from the bottom up, a negative scale for little-endian.
+    Source: Middlebury's variant of the format, with rows from bottom to top and a negative scale for
+    little-endian values.
 
     Raises:
-        FormatError: The file is missing or of another format, has three channels ('PF'), no pixel or more
-            than `read_image` accepts, an invalid scale, or a length that contradicts its header.
+        FormatError: The file is missing, is of another format or has three channels ('PF'). Or it has no
+            pixels or more than `read_image` accepts, an invalid scale, or a length that contradicts its
+            header.
     """
     check_regular(Path(path), "a PFM file")
     with reading(path, "a PFM file"), Path(path).open("rb") as file:
@@ -47,31 +49,31 @@ def read_pfm(path: str | Path) -> Float32[np.ndarray, "h w"]:
 
 
 def _parse_pfm_header(path: str | Path, content: bytes) -> tuple[tuple[int, int], str, int]:
-    """Parse a PFM header: width and height in px, NumPy's byte order, and the offset of the values."""
+    """Parse a PFM header. Returns width and height, NumPy's byte order, and the offset of the values."""
     header = _PFM_HEADER.match(content)
     if header is None:
         raise FormatError(
-            f"{path}: expected a single-channel PFM file, 'Pf', width, height and scale, "
+            f"{path}: expected a single-channel PFM header ('Pf', width, height and scale), "
             f"found {content[:12]!r}"
         )
     size_px, scale = (int(header[1]), int(header[2])), float(header[3])
     check_size(path, size_px)
     if 0 in size_px or scale == 0 or not math.isfinite(scale):
         raise FormatError(
-            f"{path}: expected a PFM file of at least one pixel and with a scale other than 0, "
-            f"found {size_px[0]}x{size_px[1]} and {scale:g}"
+            f"{path}: expected a PFM file with at least one pixel and a finite scale other than 0, "
+            f"found {size_px[0]}x{size_px[1]} pixels and a scale of {scale:g}"
         )
     return size_px, "<" if scale < 0 else ">", header.end()
 
 
 def write_pfm(path: str | Path, values: Float[np.ndarray, "h w"]) -> None:
-    """Write a single-channel PFM file, float32 and little-endian; NaN and infinity are kept."""
+    """Write a single-channel PFM file in little-endian float32; NaN and infinity are kept."""
     with replacing(path) as temporary:
         Image.fromarray(values.astype(np.float32)).save(temporary, "PPM")
 
 
 def write_float_tiff(path: str | Path, values: Float[np.ndarray, "h w"]) -> None:
-    """Write a single-channel TIFF file, float32 and uncompressed; NaN and infinity are kept."""
+    """Write a single-channel TIFF file in float32, uncompressed; NaN and infinity are kept."""
     with replacing(path) as temporary, checking_format_size(path, values.shape):
         Image.fromarray(values.astype(np.float32)).save(temporary, "TIFF")
 
@@ -87,7 +89,7 @@ def read_pixels(path: str | Path, *modes: str) -> Shaped[np.ndarray, "h w *chann
 
     Args:
         path: The picture.
-        modes: Accepted Pillow modes, such as "L", 8-bit grey, or "RGB".
+        modes: Accepted Pillow modes, such as "L" (8-bit grey) or "RGB".
 
     Raises:
         FormatError: The file is missing or damaged, or the picture has another mode.
@@ -100,7 +102,7 @@ def read_pixels(path: str | Path, *modes: str) -> Shaped[np.ndarray, "h w *chann
 
 
 def read_disparity_png(path: str | Path) -> Float32[np.ndarray, "h w"]:
-    """Read disparity in px from a 16-bit PNG of px * 256 (KITTI's format); 0, unknown, becomes NaN."""
+    """Read disparity in px from a 16-bit PNG of px * 256 (KITTI's format); 0 (unknown) becomes NaN."""
     expected = "a 16-bit grey PNG of disparity * 256"
     with open_picture(Path(path), expected=expected) as picture:
         if not picture.mode.startswith("I"):
@@ -110,7 +112,7 @@ def read_disparity_png(path: str | Path) -> Float32[np.ndarray, "h w"]:
 
 
 def write_disparity_png(path: str | Path, disparity_px: Float[np.ndarray, "h w"]) -> None:
-    """Write disparity as a 16-bit PNG of px * 256 (KITTI's format); NaN and infinity become 0, unknown.
+    """Write disparity as a 16-bit PNG of px * 256 (KITTI's format); NaN and infinity become 0 (unknown).
 
     Known disparities are written as at least 1/256 px, so that none becomes unknown.
 
@@ -128,6 +130,6 @@ def write_disparity_png(path: str | Path, disparity_px: Float[np.ndarray, "h w"]
 
 
 def write_depth_png(path: str | Path, depth_m: Float[np.ndarray, "h w"]) -> None:
-    """Write depth as a 16-bit PNG of millimetres; unknown depth and depth beyond 65.535 m become 0."""
+    """Write depth as a 16-bit PNG in millimetres; unknown depth and depth beyond 65.535 m become 0."""
     depth_mm = np.rint(depth_m * 1000)
     save_picture(path, np.where((depth_mm > 0) & (depth_mm <= 65535), depth_mm, 0).astype(np.uint16), "PNG")

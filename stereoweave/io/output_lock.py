@@ -1,6 +1,6 @@
-"""Lock that keeps an output to one command at a time.
+"""Lock that lets only one command at a time write to an output.
 
-The operating system holds the lock, so that it is released when the process ends, even if it is killed.
+The operating system releases the lock when the process ends, even if the process is killed.
 """
 
 import errno
@@ -14,20 +14,22 @@ from filelock import FileLock, Timeout
 from stereoweave.errors import OutputInUseError, StereoweaveError
 from stereoweave.io.files import make_folder
 
-# Errors of network file systems without locks, which differ by system; Linux has one number for the last two.
+# Errors of network file systems without locks; they differ between systems. On Linux the last two are equal.
 _NO_LOCKS = {errno.ENOSYS, errno.ENOLCK, errno.EINVAL, errno.EOPNOTSUPP, errno.ENOTSUP}
 
 
 @contextmanager
 def lock_output(output: Path, before_waiting: Callable[[], None] | None = None) -> Iterator[None]:
-    """Lock an output against other processes, also under another path of it.
+    """Lock an output against other processes, even those that reach it by another path.
 
     The lock file, `.lock` in a folder or `.NAME.lock` beside a file, is removed at the end. A killed process
-    leaves it behind, unlocked; the next one reuses and removes it. A disk without locks gives no protection.
+    leaves it behind, unlocked; the next process reuses and removes it. A disk without locks gives no
+    protection.
 
     Args:
         output: An existing folder, or a file, whose folder is created if it is missing.
-        before_waiting: Called before waiting for another process to release the lock. None: do not wait.
+        before_waiting: Called before waiting for another process to release the lock; without it, a locked
+            output is an error.
 
     Raises:
         OutputInUseError: if another process has the lock and `before_waiting` is None.
@@ -52,8 +54,8 @@ def lock_output(output: Path, before_waiting: Callable[[], None] | None = None) 
     try:
         yield
     finally:
-        # Remove before the release, so that no other process's file is removed: filelock does not lock a
-        # removed file. Windows cannot remove an open file; there filelock removes it.
+        # Remove before the release, so that no other process's lock file is removed: filelock does not lock a
+        # removed file. Windows cannot remove an open file; on Windows, filelock removes it.
         with suppress(OSError):
             file.unlink()
         lock.release()

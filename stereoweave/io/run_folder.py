@@ -1,6 +1,6 @@
-"""Claim of an output folder: a JSON description of its run, which other runs check before they write.
+"""Claims on output folders: a JSON description of a folder's run, which other runs check before they write.
 
-The functions take and return the text of the description, so that the folder may be on a disk or in a store.
+The functions take and return the description's text, so the folder may be on a disk or in a store.
 """
 
 import json
@@ -12,12 +12,12 @@ from stereoweave.errors import FormatError, StereoweaveError
 
 
 def describe_run(facts: Mapping[str, Any]) -> str:
-    """Write a run's facts as the JSON text of a description, which `parse_description` parses."""
+    """Return a run's facts as the JSON text of a description, which `parse_description` reads."""
     return json.dumps(facts, indent=1, default=str) + "\n"
 
 
 def parse_description(place: str | Path, text: str, expected: str) -> dict[str, Any]:
-    """Parse the facts of a description.
+    """Parse a description. Returns the run's facts.
 
     Args:
         place: Path or URL of the description, for errors.
@@ -37,27 +37,27 @@ def parse_description(place: str | Path, text: str, expected: str) -> dict[str, 
 
 
 def check_claim(place: str | Path, facts: Mapping[str, Any], found: Mapping[str, Any]) -> None:
-    """Refuse a folder that another run has claimed.
+    """Check that a folder has not been claimed by a different run.
 
     Args:
         place: Path or URL of the folder's description, for the error.
-        facts: This run's facts, as for `describe_run`.
+        facts: This run's facts, as passed to `describe_run`.
         found: The facts in the folder's description.
 
     Raises:
-        StereoweaveError: if a fact differs; the error names the first that does.
+        StereoweaveError: if any fact differs; the error names the first one.
     """
     expected = json.loads(describe_run(facts))  # JSON turns tuples into lists
     for name in expected | dict(found):
         if found.get(name) != expected.get(name):
             raise StereoweaveError(
-                f"{place}: expected {name} = {json.dumps(expected.get(name))}, as this run would make, "
+                f"{place}: expected {name} = {json.dumps(expected.get(name))} for this run, "
                 f"found {json.dumps(found.get(name))}; use the same settings or another folder"
             )
 
 
 def check_unclaimed(folder: str | Path, file: str, others: Iterable[str]) -> None:
-    """Refuse a folder that has files but no description.
+    """Check that a folder without a description has no files.
 
     Args:
         folder: Path or URL, for the error.
@@ -65,7 +65,7 @@ def check_unclaimed(folder: str | Path, file: str, others: Iterable[str]) -> Non
         others: Names of the files in the folder.
 
     Raises:
-        StereoweaveError: if there is any file.
+        StereoweaveError: if the folder has any file.
     """
     if other := min(others, default=None):
         raise StereoweaveError(f"{folder}: expected a new folder, or one with a {file}, found {other} in it")

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class _Kind(NamedTuple):
-    """An object store's library, the variables with its keys and endpoint, and the library's settings."""
+    """A kind of object store: its library, environment variables for keys and endpoint, library settings."""
 
     library: str
     keys: str
@@ -55,12 +55,12 @@ _UNREACHABLE = {
     *("EndpointConnectionError", "HTTPClientError", "ConnectionError", "ClientConnectionError"),
     *("ServiceRequestError", "ServiceResponseError", "TimeoutError", "TransportError"),
 }
-# Metadata that changes with a file's content; the first that a store reports counts.
+# Metadata that changes with a file's content; the first one that a store reports is used.
 _VERSIONS = ("ETag", "etag", "md5Hash", "updated", "last_modified")
 
 
 class StoredFile(NamedTuple):
-    """A file in a store: its path below the folder, separated by "/", its size, and its content's version."""
+    """A file in a store: path relative to the folder, separated by "/", size, and version of the content."""
 
     path: str
     size_bytes: int
@@ -69,13 +69,13 @@ class StoredFile(NamedTuple):
 
 @runtime_checkable
 class Store(Protocol):
-    """A folder on a disk or in an object store. It can be pickled, and connects on first use.
+    """A folder on a disk or in an object store; it can be pickled and connects on first use.
 
     Paths are relative to the folder and separated by "/".
 
     Raises:
-        StereoweaveError: in every method, if the folder is unreachable, or the file is missing or access to
-            it is denied.
+        StereoweaveError: by every method, if the folder is unreachable, the file is missing, or access is
+            denied.
     """
 
     @property
@@ -93,19 +93,19 @@ class Store(Protocol):
         ...
 
     def check_destination(self) -> None:
-        """Create a folder on a disk; raise a StereoweaveError if it is unreachable or its bucket missing."""
+        """Create the folder if it is on a disk; raise a StereoweaveError if the folder cannot be reached."""
         ...
 
     def files(self, below: str = "") -> Iterator[StoredFile]:
         """List the files below the folder, or below one of its subfolders, without hidden ones.
 
-        A missing folder has no files. On a disk and in s3:// the listing is lazy; the libraries of the other
-        stores list all files before the first.
+        A missing folder has no files. On a disk and in s3:// the listing is lazy; the other stores' libraries
+        list all files before they return the first one.
         """
         ...
 
     def fetch(self, path: str, into: Path) -> Path:
-        """Return a local path of the file: a copy, `into`/path, or the file itself if it is on a disk."""
+        """Return a local path of the file: the file itself if it is on a disk, else a copy at `into`/path."""
         ...
 
     def put(self, file: Path, path: str) -> None:
@@ -113,15 +113,15 @@ class Store(Protocol):
         ...
 
     def read_bytes(self, path: str) -> bytes:
-        """Read a file."""
+        """Return the content of a file."""
         ...
 
     def write_bytes(self, path: str, content: bytes) -> None:
-        """Write a file atomically."""
+        """Write content to a file, atomically."""
         ...
 
     def exists(self, path: str) -> bool:
-        """Whether the file exists."""
+        """Return whether a file exists."""
         ...
 
     def remove(self, path: str) -> None:
@@ -129,7 +129,7 @@ class Store(Protocol):
         ...
 
     def at(self, path: str) -> str:
-        """Full path or URL of a file."""
+        """Return the full path or URL of a file."""
         ...
 
 
@@ -137,7 +137,7 @@ def store_at(place: str | Path) -> Store:
     """Return the store of a path or URL, without connecting to it.
 
     Raises:
-        StereoweaveError: if the protocol is unknown, its library missing, or the URL without a bucket.
+        StereoweaveError: if the protocol is unknown, its library is missing, or the URL has no bucket.
     """
     url = _URL.fullmatch(str(place))
     if url is None:
@@ -148,7 +148,7 @@ def store_at(place: str | Path) -> Store:
     if protocol not in _KINDS:
         known = ", ".join(f"{kind}://" for kind in _KINDS)
         raise StereoweaveError(
-            f"{place}: expected a path, or a URL of {known} or file://, found {protocol}://"
+            f"{place}: expected a path, or a URL that begins with {known} or file://, found {protocol}://"
         )
     if not path.strip("/") or path.startswith("/"):
         raise StereoweaveError(f"{place}: expected {protocol}://bucket/folder, found no bucket")
@@ -219,7 +219,7 @@ class DiskStore:
 
 @dataclass(frozen=True)
 class ObjectStore:
-    """A folder in an object store: all objects whose names begin with the folder's."""
+    """A folder in an object store: all objects whose names begin with the folder's name."""
 
     place: str
 
@@ -230,7 +230,7 @@ class ObjectStore:
     def check_source(self) -> None:
         if not self._has_any():
             raise StereoweaveError(
-                f"{self.place}: expected a folder, found no object below it; check the spelling"
+                f"{self.place}: expected a folder, found no object in it; check the spelling"
             )
 
     def check_destination(self) -> None:
@@ -241,7 +241,7 @@ class ObjectStore:
             start = len(folder) - len(below) + (not below)
             for file in (_list_s3 if self._is_s3() else _list_files)(library, folder):
                 path = file.path[start:]
-                # Some programs mark a folder by an empty object whose name ends in "/".
+                # Some programs mark a folder with an empty object whose name ends in "/".
                 if path and "/." not in f"/{path}" and not path.endswith("/"):
                     yield file._replace(path=path)
 
@@ -286,17 +286,17 @@ class ObjectStore:
         return self.place.startswith("s3://")
 
     def _has_any(self) -> bool:
-        """Whether the folder has any object; an unreachable store fails within seconds."""
+        """Return whether the folder has any object; an unreachable store fails within seconds."""
         with self._library("", "a folder that can be listed") as (library, folder):
             bucket = folder.partition("/")[0]
             try:
                 if self._is_s3():
-                    # `info` would begin with a HEAD request, whose error has no reason but "Forbidden".
+                    # `info` would begin with a HEAD request, whose error gives no reason but "Forbidden".
                     return bool(_fetch_page(library, folder, MaxKeys=1, timeout=_ANSWER_S).get("Contents"))
                 with suppress(FileNotFoundError):
                     library.info(folder, timeout=_ANSWER_S)
                     return True
-                with suppress(PermissionError):  # seeing a bucket needs a permission of its own
+                with suppress(PermissionError):  # inspecting a bucket needs a separate permission
                     library.info(bucket, timeout=_ANSWER_S)
             except FileNotFoundError as error:
                 raise StereoweaveError(
@@ -307,7 +307,7 @@ class ObjectStore:
 
     @contextmanager
     def _library(self, path: str, expected: str) -> Iterator[tuple["AsyncFileSystem", str]]:
-        """Yield the store's library and its name for a path; turn its errors into a StereoweaveError."""
+        """Yield the store's library and its name for a path; turn library errors into a StereoweaveError."""
         import fsspec
 
         try:
@@ -326,21 +326,21 @@ class ObjectStore:
 
 
 def _list_entries(folder: Path) -> list[os.DirEntry[str]]:
-    """Entries of a folder by name, without hidden ones; none if the folder is missing or unreadable."""
+    """Return a folder's entries, sorted and without hidden ones; none if it is missing or unreadable."""
     with suppress(FileNotFoundError, PermissionError), os.scandir(folder) as entries:
         return sorted((entry for entry in entries if entry.name[0] != "."), key=lambda entry: entry.name)
     return []
 
 
 def _read_status(entry: os.DirEntry[str]) -> os.stat_result | None:
-    """Status of a file; None for anything else, and for a file that was just removed."""
+    """Return the status of a file; None if the entry is not a file, or has just been removed."""
     with suppress(FileNotFoundError):
         return entry.stat() if entry.is_file() else None
     return None
 
 
 def _list_s3(library: "AsyncFileSystem", folder: str) -> Iterator[StoredFile]:
-    """List the files below a folder by their full names, lazily, in pages of a thousand."""
+    """Yield the files below a folder with their full names, fetched lazily in pages of a thousand."""
     bucket = folder.partition("/")[0]
     more: dict[str, Any] | None = {}
     while more is not None:

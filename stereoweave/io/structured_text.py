@@ -1,7 +1,7 @@
-"""Safe parser of YAML, JSON and XML from untrusted files, to plain values.
+"""Safe parsing of YAML, JSON and XML from untrusted files into plain values.
 
-Anchors, aliases, DTDs and custom types are refused, and depth and number of values are checked before any
-recursion. The caller limits the length of the text, to which the time is proportional.
+Anchors, aliases and DTDs are refused, custom types are never built, and the nesting and number of values are
+checked before any recursion. Parsing time is proportional to the length of the text, which the caller limits.
 """
 
 import re
@@ -15,7 +15,7 @@ _NULLS = ("", "~", "null", "Null", "NULL")
 BASE64 = "$base64$"  # OpenCV's mark of binary data in JSON
 _DECLARATION = re.compile(r"<!(?!--|\[CDATA\[)")
 _XML_ITEM = re.compile(r'"[^"]*"|\S+')
-# Comments and tabs in JSON by OpenCV and others. Strings, terminated or not, match too, and are kept.
+# Comments and tabs in JSON written by OpenCV and others. Strings, terminated or not, match too, and are kept.
 _JSON_ALONE = re.compile(r'("(?:[^"\\]|\\.)*+"?)|//.*|\t')
 
 
@@ -27,8 +27,8 @@ def parse_entries(text: str) -> dict[str, Any]:
         string that begins with BASE64. Entries that are null in YAML or JSON are left out.
 
     Raises:
-        ValueError or SyntaxError: if the text has another format, an anchor, an alias or a DTD, is nested
-            more than 20 deep or has more than 10,000 values.
+        ValueError or SyntaxError: if the text has another format, contains an anchor, an alias or a DTD, is
+            nested more than 20 levels deep, or has more than 10,000 values.
     """
     start = text.lstrip()[:1]
     if start == "<":
@@ -41,7 +41,7 @@ def parse_entries(text: str) -> dict[str, Any]:
 
 
 class _Gate:
-    """Limits on nesting and number of values, which a parser checks before it enters each value."""
+    """Limits on the nesting and number of values, which a parser checks before it enters each value."""
 
     def __init__(self) -> None:
         self._depth = self._values = 0
@@ -65,7 +65,7 @@ class _Gate:
 
 
 class _Loader(yaml.BaseLoader):
-    """PyYAML loader of strings, lists and dicts only; other tags are ignored."""
+    """PyYAML loader that builds only strings, lists and dicts and ignores other tags."""
 
     def __init__(self, text: str) -> None:
         super().__init__(text)
@@ -114,7 +114,7 @@ def _parse_yaml(text: str) -> Any:
 
 
 class _Builder(ElementTree.TreeBuilder):
-    """ElementTree builder with limits on nesting and number of values."""
+    """ElementTree builder with limits on the nesting and number of values."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -134,7 +134,7 @@ class _Builder(ElementTree.TreeBuilder):
 
 
 def _parse_xml(text: str) -> Any:
-    # Before parsing: entities can include files, and expand without limit.
+    # Refuse before parsing, because entities can include files and expand without limit.
     if _DECLARATION.search(text):
         raise ValueError("XML with a DTD")
     root = ElementTree.fromstring(text, parser=ElementTree.XMLParser(target=_Builder()))

@@ -1,4 +1,4 @@
-"""Text files and CSV tables that stay valid and safe with any file name in them."""
+"""Text files and CSV tables that are valid and safe to open, whatever file names they contain."""
 
 import csv
 import re
@@ -10,20 +10,20 @@ from typing import Any, TextIO
 
 from stereoweave.io.files import replacing
 
-# Beginnings of formulas in spreadsheets (OWASP, "CSV Injection"), and the quote that marks a text, so that
-# different names stay different.
+# Beginnings of formulas in spreadsheets (OWASP, "CSV Injection"), and the quote that marks a text: if it were
+# not escaped too, two names could become equal.
 _COMPUTED = ("=", "+", "-", "@", "\t", "\r", "\n", "'")
-# Where a spreadsheet may begin a cell: the separator depends on its language, and quotes within a cell do
-# not prevent a split.
+# Places where a spreadsheet may begin a cell: the separator depends on its language, and quotes within a cell
+# do not prevent a split.
 _CELL_STARTS = re.compile(r"(?<=[;\t\r\n])(?![\t\r\n])")
 _NUMBER = re.compile(r"-([0-9.]+(e[-+]?[0-9]+)?|inf)")
 
 
 @contextmanager
 def writing_text(path: str | Path) -> Iterator[TextIO]:
-    r"""Write a UTF-8 text file atomically, without translating line ends.
+    r"""Write a UTF-8 text file atomically, without translating line endings.
 
-    Bytes of a name that are not UTF-8 are escaped as in Python: gr\udcfcn for b"gr\xfcn".
+    Bytes of a file name that are not valid UTF-8 are escaped as in Python: gr\udcfcn for b"gr\xfcn".
     """
     with (
         replacing(path) as temporary,
@@ -33,7 +33,7 @@ def writing_text(path: str | Path) -> Iterator[TextIO]:
 
 
 def write_table(path: str | Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
-    """Write a CSV file with a header; a text that a spreadsheet would run as a formula gets a leading '."""
+    """Write a CSV file with a header; text that a spreadsheet would run as a formula gets a leading '."""
     with writing_text(path) as file:
         writer = csv.DictWriter(file, columns)
         writer.writeheader()
@@ -47,5 +47,5 @@ def _escape_formulas(value: Any) -> Any:
 
 
 def _is_computed(cell: str) -> bool:
-    """Whether it begins like a formula, also with a full-width sign (＝) or after blanks."""
+    """Return whether a cell begins like a formula, even with a full-width sign (＝) or leading blanks."""
     return cell.startswith(_COMPUTED) or unicodedata.normalize("NFKC", cell).lstrip().startswith(_COMPUTED)

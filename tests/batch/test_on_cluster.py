@@ -114,7 +114,7 @@ def test_a_machine_that_sees_another_folder_or_would_make_other_pairs_is_named(t
     words = ["set.json: expected the description of a set", "found no such file", platform.node()]
     assert [word for word in words if word not in message] == []
     message = error_of(making._prepare_node, replace(SPEC, seed=4), tmp_path / "set", "shards", PAIR_MAKER)
-    assert "expected seed = 4, as this run would make, found 3" in message
+    assert "expected seed = 4 for this run, found 3" in message
     assert message.endswith("on a shared disk and the same versions of all packages")
 
 

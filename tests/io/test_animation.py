@@ -1,4 +1,4 @@
-"""Animations as they are read again, and what is left of those that fail."""
+"""Animations are read back as they were written; failed ones leave nothing behind."""
 
 import resource
 import sys
@@ -17,7 +17,7 @@ ENDINGS = [".mp4", ".gif", ".webp"]
 
 @pytest.fixture
 def moving(rng) -> list[np.ndarray]:
-    """Seven pictures of 64x48: a soft pattern of many colours that goes to the left by 4 px a frame."""
+    """Return seven images of 64x48 px: a soft, colourful pattern that moves left by 4 px per frame."""
     coarse = Image.fromarray(rng.integers(0, 256, (6, 11, 3), dtype=np.uint8))
     wide = np.asarray(coarse.resize((88, 48), Image.BICUBIC))
     return [wide[:, start : start + 64].copy() for start in range(0, 28, 4)]
@@ -32,16 +32,16 @@ def read_again(path) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
-def test_the_frames_come_back_in_their_order(tmp_path, moving, ending):
+def test_frames_are_read_back_in_order(tmp_path, moving, ending):
     write_animation(tmp_path / f"a{ending}", iter(moving), 60)
     found = read_again(tmp_path / f"a{ending}")
     assert len(found) == 7
     for frame, expected in zip(found, moving, strict=True):
-        assert np.abs(frame.astype(int) - expected).mean() < 12  # one frame beside, it is 50
+        assert np.abs(frame.astype(int) - expected).mean() < 12  # the next frame differs by 50
     assert [file.name for file in tmp_path.iterdir()] == [f"a{ending}"]
 
 
-def test_an_mp4_is_what_every_player_takes_and_keeps_its_times(tmp_path, moving):
+def test_an_mp4_uses_the_most_compatible_format_and_keeps_frame_durations(tmp_path, moving):
     write_animation(tmp_path / "a.mp4", moving, 60)
     with av.open(tmp_path / "a.mp4") as film:
         (stream,) = film.streams
@@ -50,11 +50,11 @@ def test_an_mp4_is_what_every_player_takes_and_keeps_its_times(tmp_path, moving)
         times_ms = [float(1000 * frame.pts * frame.time_base) for frame in film.decode(video=0)]
     assert times_ms == [60 * index for index in range(7)]
     content = (tmp_path / "a.mp4").read_bytes()
-    assert content.index(b"moov") < content.index(b"mdat")  # begins to play before it is there whole
+    assert content.index(b"moov") < content.index(b"mdat")  # starts to play before the download is complete
 
 
 @pytest.mark.parametrize("ending", [".gif", ".webp"])
-def test_a_gif_and_a_webp_keep_their_times_and_never_end(tmp_path, moving, ending):
+def test_a_gif_and_a_webp_keep_frame_durations_and_loop_forever(tmp_path, moving, ending):
     write_animation(tmp_path / f"a{ending}", moving, 60)
     with Image.open(tmp_path / f"a{ending}") as file:
         assert file.info["loop"] == 0
@@ -66,13 +66,13 @@ def test_a_gif_and_a_webp_keep_their_times_and_never_end(tmp_path, moving, endin
     assert durations_ms == [60] * 7
 
 
-def test_an_mp4_says_how_its_colours_are_meant(tmp_path):
+def test_an_mp4_declares_its_colour_space(tmp_path):
     colours = [(200, 30, 40), (20, 180, 60), (10, 40, 210), (230, 230, 230)]
     frame = np.repeat(np.array([colours], np.uint8), 16, axis=1).repeat(32, axis=0)
     write_animation(tmp_path / "a.mp4", [frame] * 2, 40)
     with av.open(tmp_path / "a.mp4") as film:
         picture = next(film.decode(video=0))
-    # BT.709 of limited range, which players take for granted in high definition: 16 + 219 * (0.2126 R + ...)
+    # BT.709 with limited range, which players assume for high definition: 16 + 219 * (0.2126 R + ...)
     luma = picture.to_ndarray()[8, 8::16]
     expected = [
         16 + 219 / 255 * (0.2126 * red + 0.7152 * green + 0.0722 * blue) for red, green, blue in colours
@@ -92,12 +92,12 @@ def test_the_last_column_and_row_of_odd_sides_are_repeated_in_an_mp4(tmp_path, m
 
 
 @pytest.mark.parametrize("ending", [".gif", ".webp"])
-def test_odd_sides_stay_where_the_format_allows_them(tmp_path, moving, ending):
+def test_odd_sides_are_kept_if_the_format_allows_them(tmp_path, moving, ending):
     write_animation(tmp_path / f"a{ending}", [frame[:47, :63] for frame in moving], 40)
     assert read_again(tmp_path / f"a{ending}")[0].shape == (47, 63, 3)
 
 
-def test_the_frames_of_an_mp4_are_never_held_together(tmp_path):
+def test_the_frames_of_an_mp4_are_not_all_in_memory_at_once(tmp_path):
     alive: list[weakref.ref] = []
     most = 0
 
@@ -121,7 +121,7 @@ def test_the_frames_of_a_gif_share_their_256_colours(tmp_path, moving):
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
-def test_a_single_frame_is_enough_and_none_is_not(tmp_path, moving, ending):
+def test_a_single_frame_is_enough_and_no_frame_is_an_error(tmp_path, moving, ending):
     write_animation(tmp_path / f"a{ending}", moving[:1], 40)
     assert len(read_again(tmp_path / f"a{ending}")) == 1
     with pytest.raises(StereoweaveError, match="frames: expected one or more"):
@@ -130,16 +130,16 @@ def test_a_single_frame_is_enough_and_none_is_not(tmp_path, moving, ending):
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
-def test_frames_of_two_sizes_are_told_and_leave_nothing_behind(
-    tmp_path, moving, ending, without_shape_checks
-):
-    with pytest.raises(StereoweaveError, match="frames: expected all of one size, found 64x48 and 60x48"):
+def test_frames_of_two_sizes_are_refused_and_leave_no_file(tmp_path, moving, ending, without_shape_checks):
+    with pytest.raises(
+        StereoweaveError, match="frames: expected all to have the same size, found 64x48 and 60x48"
+    ):
         write_animation(tmp_path / f"a{ending}", [*moving, moving[0][:, :60]], 40)
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
-def test_an_error_half_way_keeps_the_file_that_was_there(tmp_path, moving, ending):
+def test_an_error_halfway_keeps_the_earlier_file(tmp_path, moving, ending):
     (tmp_path / f"a{ending}").write_text("kept")
 
     def breaking():
@@ -152,7 +152,7 @@ def test_an_error_half_way_keeps_the_file_that_was_there(tmp_path, moving, endin
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
-def test_a_disk_that_is_full_is_told_in_one_line_and_left_as_it_was(tmp_path, rng, ending):
+def test_a_full_disk_is_a_one_line_error_and_leaves_no_file(tmp_path, rng, ending):
     noise = rng.integers(0, 256, (4, 128, 128, 3), dtype=np.uint8)
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
@@ -166,12 +166,12 @@ def test_a_disk_that_is_full_is_told_in_one_line_and_left_as_it_was(tmp_path, rn
 
 
 @pytest.mark.parametrize("path", ["a.avi", "a.png", "a"])
-def test_another_ending_is_told_with_those_there_are(path):
+def test_an_unknown_ending_is_refused_with_a_list_of_the_known_ones(path):
     with pytest.raises(StereoweaveError, match=rf"{path}: expected .* \.mp4, \.gif, \.webp, found"):
         check_animation_ending(path)
 
 
-def test_an_mp4_without_pyav_names_the_extra_before_a_frame_is_made(tmp_path, monkeypatch):
+def test_an_mp4_without_pyav_names_the_extra_before_a_frame_is_rendered(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
 
     def never():

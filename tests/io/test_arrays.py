@@ -10,11 +10,11 @@ from stereoweave.errors import StereoweaveError
 from stereoweave.io.arrays import as_rgb
 from stereoweave.io.images import read_image
 
-# Neighbouring values differ everywhere, so that no mix-up of axes or channels stays unseen.
+# Neighbouring values differ everywhere, so that swapped axes or channels are detected.
 COLOURS = np.arange(40 * 50 * 3).reshape(40, 50, 3).astype(np.uint8)
 
 
-def test_a_uint8_rgb_array_is_given_back_itself():
+def test_a_uint8_rgb_array_is_returned_itself():
     assert as_rgb(COLOURS) is COLOURS
 
 
@@ -30,7 +30,7 @@ def test_alpha_is_dropped():
     np.testing.assert_array_equal(as_rgb(np.moveaxis(with_alpha, 2, 0)), COLOURS)
 
 
-def test_of_16_bits_the_upper_byte_stays_in_either_byte_order():
+def test_16_bits_are_reduced_to_the_upper_byte_in_either_byte_order():
     deep = COLOURS.astype(np.uint16) * 256 + 255
     np.testing.assert_array_equal(as_rgb(deep), COLOURS)
     np.testing.assert_array_equal(as_rgb(deep.astype(">u2")), COLOURS)
@@ -42,18 +42,18 @@ def test_a_float_is_the_share_of_white(dtype):
     assert as_rgb(shares)[0, 0].tolist() == [0, 128, 255]  # 127.5 is rounded to even
 
 
-def test_what_rounds_to_a_level_is_no_float_outside_of_the_range():
+def test_a_float_slightly_outside_the_range_is_accepted():
     for dtype in (np.float16, np.float32, np.float64):
         assert as_rgb(np.full((40, 50), 1.001, dtype))[0, 0].tolist() == [255, 255, 255]
         assert as_rgb(np.full((40, 50), -0.001, dtype))[0, 0].tolist() == [0, 0, 0]
 
 
-def test_what_comes_out_is_contiguous():
+def test_the_result_is_contiguous():
     for picture in (COLOURS[:, ::-1], np.moveaxis(COLOURS, 2, 0), np.dstack([COLOURS, COLOURS[..., :1]])):
         assert as_rgb(picture).flags.c_contiguous
 
 
-def test_the_last_axis_of_three_counts_as_the_channels_before_the_first_does():
+def test_channels_are_in_the_last_axis_if_its_length_fits():
     assert as_rgb(np.zeros((3, 50, 3), np.uint8)).shape == (3, 50, 3)
     assert as_rgb(np.zeros((3, 50, 40), np.uint8)).shape == (50, 40, 3)
 
@@ -79,12 +79,12 @@ def test_the_last_axis_of_three_counts_as_the_channels_before_the_first_does():
         "RGBa",
     ],
 )
-def test_a_pil_image_of_any_mode_is_taken(mode):
+def test_a_pil_image_of_any_mode_is_accepted(mode):
     image = as_rgb(Image.new(mode, (50, 40)))
     assert (image.shape, image.dtype) == ((40, 50, 3), np.uint8)
 
 
-def test_a_pil_image_in_colours_has_the_pixels_of_the_array_it_was_made_from():
+def test_a_pil_colour_image_has_the_pixels_of_its_array():
     picture = Image.fromarray(COLOURS)
     np.testing.assert_array_equal(as_rgb(picture), COLOURS)
     assert as_rgb(picture).flags.writeable
@@ -99,7 +99,7 @@ def test_a_32_bit_pil_image_is_read_as_the_same_file_is(tmp_path, values):
 
 def test_a_pil_image_is_not_turned_by_its_exif_tag():
     picture = Image.fromarray(COLOURS)
-    picture.getexif()[0x0112] = 6  # to be shown turned by a quarter
+    picture.getexif()[0x0112] = 6  # rotate by 90 degrees for display
     assert as_rgb(picture).shape == (40, 50, 3)
 
 
@@ -109,12 +109,12 @@ def test_a_pil_image_is_not_turned_by_its_exif_tag():
     ids=["h w 3", "3 h w", "1 3 h w", "1 h w 3"],
 )
 @pytest.mark.parametrize("as_kind", [lambda t: t, lambda t: t.float() / 255, lambda t: t.double() / 255])
-def test_a_tensor_is_taken_whichever_its_axes_and_type(arrange, as_kind):
+def test_a_tensor_is_accepted_with_any_axis_order_and_type(arrange, as_kind):
     tensor = arrange(as_kind(torch.from_numpy(COLOURS)))
     np.testing.assert_array_equal(as_rgb(tensor), COLOURS)
 
 
-def test_a_tensor_that_needs_its_gradient_or_has_half_a_float_is_taken():
+def test_a_tensor_with_a_gradient_or_of_half_precision_is_accepted():
     white = torch.ones(3, 40, 50, requires_grad=True)
     for tensor in (white, white.half(), white.bfloat16()):
         assert (as_rgb(tensor) == 255).all()
@@ -124,7 +124,7 @@ def test_a_grey_tensor_is_repeated():
     assert as_rgb(torch.full((1, 40, 50), 9, dtype=torch.uint8))[3, 4].tolist() == [9, 9, 9]
 
 
-def test_taking_pictures_does_not_import_pytorch():
+def test_converting_images_does_not_import_pytorch():
     program = "import sys, stereoweave.io.arrays; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
 
@@ -139,18 +139,18 @@ def test_taking_pictures_does_not_import_pytorch():
         (np.zeros((40, 50, 2), np.uint8), ["got [40, 50, 2]"]),
         (np.zeros(3), ["got [3]"]),
         (np.zeros((40, 50, 3), np.int64), ["int64 [40, 50, 3]", "astype('uint8')"]),
-        (np.zeros((40, 50), bool), ["bool [40, 50]", "uint8, uint16 or a float"]),
-        (torch.full((3, 40, 50), 255.0), ["float32 [3, 40, 50]", "of 255 to 255", "divide"]),
+        (np.zeros((40, 50), bool), ["bool [40, 50]", "uint8, uint16 or floats"]),
+        (torch.full((3, 40, 50), 255.0), ["float32 [3, 40, 50]", "from 255 to 255", "divide"]),
         (np.full((40, 50, 3), -0.1), ["float64", "-0.1", "0..1"]),
-        (np.full((40, 50), np.nan), ["nan", "fill NaN"]),
-        (np.full((40, 50), 1e308), ["of 1e+308 to 1e+308"]),
-        (torch.full((40, 50), 300.0).half().numpy(), ["float16", "of 300 to 300"]),
+        (np.full((40, 50), np.nan), ["nan", "replace NaN"]),
+        (np.full((40, 50), 1e308), ["from 1e+308 to 1e+308"]),
+        (torch.full((40, 50), 300.0).half().numpy(), ["float16", "from 300 to 300"]),
         (Image.new("I", (0, 0)), ["int32 [0, 0]"]),
-        (Image.new("F", (50, 40), 3), ["float32 [40, 50]", "of 3 to 3"]),
+        (Image.new("F", (50, 40), 3), ["float32 [40, 50]", "from 3 to 3"]),
         (Image.new("I", (50, 40), 70000), ["int32"]),
     ],
 )
-def test_anything_else_is_refused_in_a_line_that_says_what_it_is(thing, words):
+def test_anything_else_is_refused_in_one_line_that_describes_it(thing, words):
     with pytest.raises(StereoweaveError, match=r"^left picture: expected") as refusal:
         as_rgb(thing, "left picture")
     assert "\n" not in str(refusal.value)

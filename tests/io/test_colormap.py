@@ -9,7 +9,7 @@ from stereoweave.io.colormap import (
 )
 
 
-def test_a_few_stray_disparities_do_not_take_the_contrast_of_all():
+def test_a_few_outliers_do_not_reduce_the_contrast():
     disparity_px = np.linspace(10, 50, 1000, dtype=np.float32).reshape(20, 50)
     disparity_px[0, 0], disparity_px[19, 49] = -900, 900
     low_px, high_px = find_colour_range_px(disparity_px)
@@ -33,7 +33,7 @@ def test_disparities_beyond_the_range_get_its_end_colours():
     assert (above == high).all()
 
 
-def test_confidence_is_grey_and_what_one_camera_sees_is_not():
+def test_confidence_is_grey_and_occluded_pixels_are_not():
     picture = colour_confidence(
         np.array([[0, 0.2, 1, 1]], np.float32), np.array([[False, False, False, True]])
     )

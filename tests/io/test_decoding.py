@@ -1,4 +1,4 @@
-"""Every way in reads the same kinds of pictures, with the same limits, colours and errors."""
+"""Every entry point reads the same picture formats, with the same limits, colours and errors."""
 
 import io
 import os
@@ -38,13 +38,13 @@ ORIENTATION = 0x0112
 
 @pytest.fixture
 def picture():
-    """Smooth, and different in every channel and direction; the two views are the same."""
+    """Return a smooth image that differs in every channel and direction; both views are the same."""
     y, x = np.mgrid[:64, :96]
     return np.stack([2 * x, 3 * y, 255 - x - 2 * y], axis=-1).astype(np.uint8)
 
 
 def refusal(function, *arguments):
-    """The message, of one line, of the FormatError that the call must end in."""
+    """Return the one-line message of the FormatError that the call must raise."""
     with pytest.raises(FormatError) as caught:
         function(*arguments)
     message = str(caught.value)
@@ -58,7 +58,7 @@ def encoded(image, kind, **options):
     return out.getvalue()
 
 
-# All ways alike
+# Agreement of all entry points
 
 
 def by_service(folder: Path):
@@ -82,7 +82,7 @@ def by_video(folder: Path):
     return StereoPair(left=frame.left, right=frame.right)
 
 
-# What each way makes of a folder's left.png and right.png.
+# The result of each entry point for a folder's left.png and right.png.
 WAYS: dict[str, Callable[[Path], StereoPair]] = {
     "read_image": lambda folder: StereoPair(
         left=read_image(folder / "left.png"), right=read_image(str(folder / "right.png"))
@@ -98,7 +98,7 @@ WAYS: dict[str, Callable[[Path], StereoPair]] = {
 
 
 def fill(folder: Path, content: bytes) -> Path:
-    """The folder as all ways take it, with this as the left and the right picture."""
+    """Return the folder with this content as the left and the right picture, for all entry points."""
     (folder / "frames").mkdir(parents=True)
     names = ("left.png", "right.png", "view_0.5.png", "frames/left_0.png", "frames/right_0.png")
     for name in names:
@@ -107,10 +107,10 @@ def fill(folder: Path, content: bytes) -> Path:
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_every_way_turns_a_picture_upright_and_converts_its_colours(tmp_path, picture, way):
+def test_every_entry_point_turns_a_picture_upright_and_converts_its_colours(tmp_path, picture, way):
     tags = Image.Exif()
     tags[ORIENTATION] = 6
-    lying = np.rot90(picture)[..., ::-1].copy()  # to be turned clockwise; red and blue are each other's
+    lying = np.rot90(picture)[..., ::-1].copy()  # needs a clockwise rotation; red and blue are swapped
     swapped = profile("Swapped", SRGB[2], SRGB[1], SRGB[0])
     folder = fill(tmp_path / "scene", encoded(lying, "PNG", exif=tags, icc_profile=swapped))
     Image.new("I;16", (96, 64), 256).save(folder / "disparity.png")
@@ -119,7 +119,7 @@ def test_every_way_turns_a_picture_upright_and_converts_its_colours(tmp_path, pi
     np.testing.assert_array_equal(pair.right, pair.left)
 
 
-def test_an_icc_tagged_png_gives_the_same_pixels_by_the_api_and_by_every_other_way(tmp_path):
+def test_a_png_with_an_icc_profile_has_the_same_pixels_in_every_entry_point(tmp_path):
     swapped = profile("Swapped", SRGB[2], SRGB[1], SRGB[0])
     image = np.full((64, 96, 3), (200, 60, 60), np.uint8)
     folder = fill(tmp_path / "scene", encoded(image, "PNG", icc_profile=swapped))
@@ -142,7 +142,7 @@ def by_boards(folder: Path) -> str:
     return str(caught.value)
 
 
-def test_every_way_refuses_a_damaged_picture_with_the_same_words(tmp_path, picture, capsys):
+def test_every_entry_point_refuses_a_damaged_picture_with_the_same_words(tmp_path, picture, capsys):
     content = encoded(np.tile(picture, (4, 4, 1)), "PNG")
     folder = fill(tmp_path / "scene", content[:1500])
     Image.new("I;16", (384, 256), 256).save(folder / "disparity.png")
@@ -161,17 +161,17 @@ def test_no_other_module_opens_pictures():
     assert found == ["decoding.py"]
 
 
-# Kinds
+# Formats
 
 
-def test_postscript_under_the_name_of_a_picture_is_no_picture(tmp_path):
+def test_postscript_with_the_ending_of_a_picture_is_refused(tmp_path):
     path = tmp_path / "left.png"
     path.write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 90 90\n%%EndComments\nshowpage\n")
     for read in (read_image, read_disparity_png, lambda at: read_pixels(at, "RGB")):
         assert refusal(read, path).endswith("found something else")
 
 
-def test_an_animation_is_refused_by_python_too(tmp_path, picture):
+def test_read_image_refuses_an_animation(tmp_path, picture):
     path = tmp_path / "a.gif"
     path.write_bytes(encoded(picture, "GIF", save_all=True, append_images=[Image.fromarray(255 - picture)]))
     assert "an animation of 2" in refusal(read_image, path)
@@ -190,7 +190,7 @@ def test_an_animation_is_refused_by_python_too(tmp_path, picture):
         ("I", 90 * 257, 90),
     ],
 )
-def test_grey_is_the_same_however_it_is_stored(tmp_path, mode, colour, expected):
+def test_grey_is_the_same_in_every_pixel_format(tmp_path, mode, colour, expected):
     path = tmp_path / "grey.tif"
     Image.new(mode, (40, 40), colour).save(path)
     np.testing.assert_array_equal(read_image(path), np.full((40, 40, 3), expected, np.uint8))
@@ -236,7 +236,7 @@ def test_one_picture_may_hold_two_views_of_the_greatest_length(tmp_path):
     )
 
 
-# What is no file
+# Paths that are not regular files
 
 PROGRAM = """
 import sys
@@ -253,7 +253,7 @@ for path in (*sys.argv[1:], "a\\0b.png"):
 """
 
 
-def test_a_pipe_a_device_a_loop_and_no_name_are_one_line_each_at_once(tmp_path):
+def test_a_pipe_a_device_a_loop_and_an_invalid_name_are_one_line_errors_at_once(tmp_path):
     os.mkfifo(tmp_path / "pipe.png")
     (tmp_path / "loop.png").symlink_to(tmp_path / "loop.png")
     paths = [tmp_path / "pipe.png", "/dev/zero", tmp_path / "loop.png", tmp_path, tmp_path / "none.png"]
@@ -270,8 +270,8 @@ def test_a_pipe_a_device_a_loop_and_no_name_are_one_line_each_at_once(tmp_path):
     assert all(line.startswith(("FormatError ", "stereoweave: ")) for line in lines)
 
 
-def test_a_damaged_tiff_writes_nothing_beside_its_error(tmp_path):
-    # 65,535 samples a pixel, which Pillow logs before it raises.
+def test_a_damaged_tiff_prints_nothing_but_its_error(tmp_path):
+    # 65,535 samples per pixel, which Pillow logs before it raises an error.
     tags = [(256, 4, 40), (257, 4, 40), (258, 3, 8), (262, 3, 1), (273, 4, 8), (277, 3, 65535), (279, 4, 99)]
     entries = b"".join(struct.pack("<HHII", tag, kind, 1, value) for tag, kind, value in tags)
     path = tmp_path / "left.tif"
@@ -299,7 +299,7 @@ KINDS = {
 
 
 def read_in_all_ways(path: Path) -> int:
-    """How many ways of reading refuse the file; none of them ends in anything but an image or a refusal."""
+    """Return the number of readers that refuse the file; each must return an image or raise FormatError."""
     refused = 0
     for read in (
         read_image,
@@ -345,7 +345,7 @@ def test_an_mpo_file_cut_within_the_head_of_its_second_picture_is_refused(tmp_pa
 
 
 @pytest.mark.parametrize("mark", [b"!", b","])
-def test_a_gif_that_ends_where_a_further_picture_begins_is_refused(tmp_path, picture, mark):
+def test_a_gif_that_is_cut_where_another_picture_begins_is_refused(tmp_path, picture, mark):
     path = tmp_path / "damaged.gif"
     path.write_bytes(encoded(picture, "GIF").removesuffix(b";") + mark)
     for read in (read_image, lambda at: open_pictures([at]), lambda at: read_pixels(at, "P")):
@@ -363,13 +363,13 @@ def test_a_gif_that_ends_where_a_further_picture_begins_is_refused(tmp_path, pic
         (b"Pf\n" + b"9" * 5000 + b" 3\n-1.0\n", "found b'Pf"),
         (b"Pf\n-2 -2\n-1.0\n", "found b'Pf"),
         (b"Pf\n0 0\n-1.0\n", "at least one pixel"),
-        (b"Pf\n2 2\nnan\n", "a scale other than 0"),
-        (b"Pf\n2 2\ninf\n", "a scale other than 0"),
-        (b"Pf\n2 2\n0\n", "a scale other than 0"),
+        (b"Pf\n2 2\nnan\n", "a finite scale other than 0"),
+        (b"Pf\n2 2\ninf\n", "a finite scale other than 0"),
+        (b"Pf\n2 2\n0\n", "a finite scale other than 0"),
         (b"Pf\n1 32767\n-1.0\n", "at most 32766 pixels a side"),
     ],
 )
-def test_a_pfm_file_of_an_impossible_header_is_refused(tmp_path, header, found):
+def test_a_pfm_file_with_an_invalid_header_is_refused(tmp_path, header, found):
     path = tmp_path / "map.pfm"
     path.write_bytes(header + bytes(16))
     assert found in refusal(read_pfm, path)
@@ -379,5 +379,5 @@ def test_a_pfm_file_longer_than_its_header_says_is_not_read_into_memory(tmp_path
     path = tmp_path / "map.pfm"
     with path.open("wb") as file:
         file.write(b"Pf\n2 2\n-1.0\n")
-        file.truncate(2**40)  # of which the disk stores nothing
+        file.truncate(2**40)  # a sparse file, which takes no space on the disk
     assert "expected 16 bytes for 2x2 values" in refusal(read_pfm, path)

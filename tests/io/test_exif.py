@@ -14,7 +14,7 @@ FOCAL_MM, FOCAL_35_MM, WIDTH_PX, PLANE_X, PLANE_UNIT = 0x920A, 0xA405, 0xA002, 0
 
 
 def tags_of(path, tags=(), model=None, lies=None):
-    """The tags of a JPEG that was saved with them."""
+    """Save a JPEG with these tags and return the tags that are read from it."""
     written = Image.Exif()
     written.get_ifd(EXIF).update(tags)
     if model:
@@ -27,7 +27,7 @@ def tags_of(path, tags=(), model=None, lies=None):
 
 
 def multi_picture(number=None, baseline=None):
-    """A header of the Multi-Picture Format: a viewpoint, and a baseline as a fraction of metres."""
+    """Return a Multi-Picture Format header with a viewpoint, and a baseline as a fraction in metres."""
     entries = [struct.pack("<HHLL", 0xB101, 4, 1, number)] if number else []
     after = 8 + 2 + 12 * (len(entries) + 1) + 4
     if baseline:
@@ -36,7 +36,7 @@ def multi_picture(number=None, baseline=None):
     return b"II\x2a\x00" + struct.pack("<L", 8) + directory + struct.pack("<LL", *(baseline or (0, 0)))
 
 
-def test_a_focal_length_on_film_is_one_of_the_same_diagonal_angle(tmp_path):
+def test_a_focal_length_on_film_gives_the_same_diagonal_angle_of_view(tmp_path):
     tags = tags_of(tmp_path / "a.jpg", {FOCAL_35_MM: 26})
     # 4000x3000 has a diagonal of 5000 px, 36 mm x 24 mm one of 43.267 mm.
     lens = exif.read_lens(tags, 4000, 3000)
@@ -47,8 +47,8 @@ def test_a_focal_length_on_film_is_one_of_the_same_diagonal_angle(tmp_path):
     assert exif.read_lens(tags, 3000, 4000) == lens
 
 
-def test_a_focal_length_in_mm_needs_the_density_of_the_sensor_and_grows_with_the_picture(tmp_path):
-    # 6.3 mm at 5000 px a cm are 3150 px of the picture that was taken, 3648 px wide.
+def test_a_focal_length_in_mm_needs_the_sensor_density_and_scales_with_the_picture(tmp_path):
+    # 6.3 mm at 5000 px per cm are 3150 px of the original picture, which was 3648 px wide.
     tags = {
         FOCAL_MM: IFDRational(63, 10),
         PLANE_X: IFDRational(5000, 1),
@@ -65,19 +65,19 @@ def test_a_focal_length_in_mm_needs_the_density_of_the_sensor_and_grows_with_the
             assert exif.read_lens(tags_of(tmp_path / "a.jpg", some), 3648, 2736) is None
 
 
-def test_of_both_the_length_on_film_is_taken_which_a_rescaled_picture_keeps(tmp_path):
+def test_the_focal_length_on_film_is_preferred_because_rescaling_keeps_it(tmp_path):
     tags = {FOCAL_35_MM: 36, FOCAL_MM: IFDRational(5, 1), PLANE_X: IFDRational(1, 1), WIDTH_PX: 10}
     assert exif.read_lens(tags_of(tmp_path / "a.jpg", tags), 600, 400).focal_px == pytest.approx(600)
 
 
 @pytest.mark.parametrize("value", [0, 65535.5])
-def test_an_unknown_or_odd_focal_length_is_none(tmp_path, value):
+def test_an_unknown_or_invalid_focal_length_is_none(tmp_path, value):
     assert exif.read_lens({FOCAL_35_MM: 0}, 40, 32) is None
     assert exif.read_lens({FOCAL_MM: IFDRational(1, 0), PLANE_X: "text", WIDTH_PX: value}, 40, 32) is None
 
 
-def test_a_focal_length_that_no_lens_has_is_none_or_that_of_the_other_tags():
-    # 4000x3000 has a diagonal of 5000 px: 65535 mm on film are 7.6 million px, and 10 mm at 1 px a mm are 10.
+def test_an_implausible_focal_length_is_ignored():
+    # 4000x3000 has a diagonal of 5000 px: 65535 mm on film are 7.6 million px, 10 mm at 1 px a mm are 10 px.
     assert exif.read_lens({FOCAL_35_MM: 65535}, 4000, 3000) is None
     sensor = {FOCAL_MM: 10, PLANE_UNIT: 4, WIDTH_PX: 4000}
     assert exif.read_lens(sensor | {PLANE_X: 1}, 4000, 3000) is None
@@ -98,7 +98,7 @@ def test_the_baseline_of_an_mpo_frame_is_read_in_metres():
 
 def test_an_unknown_baseline_is_none_and_not_one_metre():
     picture = Image.new("RGB", (40, 32))
-    picture.info["mp"] = multi_picture(baseline=(0xFFFFFFFF, 0xFFFFFFFF))  # CIPA DC-007's way to say so
+    picture.info["mp"] = multi_picture(baseline=(0xFFFFFFFF, 0xFFFFFFFF))  # "unknown" in CIPA DC-007
     assert exif.read_lens(exif.read_tags(picture), 40, 32) is None
 
 
@@ -106,20 +106,20 @@ def test_an_unknown_baseline_is_none_and_not_one_metre():
     ("model", "baseline_m"),
     [("FinePix REAL 3D W1", 0.077), ("FinePix REAL 3D W3", 0.075), ("Nintendo 3DS", 0.035)],
 )
-def test_known_cameras_that_leave_their_baseline_out_have_it(tmp_path, model, baseline_m):
+def test_known_cameras_that_do_not_store_their_baseline_have_one(tmp_path, model, baseline_m):
     tags = tags_of(tmp_path / "a.jpg", model=model)
     assert exif.read_lens(tags, 40, 32) == exif.Lens(baseline_m=baseline_m)
     assert exif.read_lens(tags_of(tmp_path / "a.jpg", model="Some phone"), 40, 32) is None
 
 
-def test_a_picture_without_tags_says_nothing():
+def test_a_picture_without_tags_has_no_lens_or_orientation():
     tags = exif.read_tags(Image.new("RGB", (40, 32)))
     assert tags == {}
     assert exif.read_orientation(tags) is None
     assert exif.read_lens(tags, 40, 32) is None
 
 
-def test_damaged_tags_say_nothing_or_what_is_left_of_them(rng):
+def test_damaged_tags_raise_no_error(rng):
     written = Image.Exif()
     written.get_ifd(EXIF).update({FOCAL_35_MM: 26, FOCAL_MM: IFDRational(63, 10)})
     written[ORIENTATION] = 6
@@ -138,7 +138,7 @@ def test_damaged_tags_say_nothing_or_what_is_left_of_them(rng):
 @pytest.mark.parametrize(
     ("lies", "upright"),
     [
-        # EXIF says where the stored first row and first column are: of 6, "right" and "top".
+        # EXIF states where the stored first row and first column belong: "right" and "top" for 6.
         (1, "ab/cd"),
         (2, "ba/dc"),
         (3, "dc/ba"),
@@ -149,7 +149,7 @@ def test_damaged_tags_say_nothing_or_what_is_left_of_them(rng):
         (8, "bd/ac"),
     ],
 )
-def test_a_picture_is_turned_upright_from_each_of_the_eight_ways_to_lie(tmp_path, lies, upright):
+def test_a_picture_is_turned_upright_from_each_of_the_eight_orientations(tmp_path, lies, upright):
     stored = Image.fromarray(np.array([[ord("a"), ord("b")], [ord("c"), ord("d")]], np.uint8))
     assert exif.read_orientation(tags_of(tmp_path / "a.jpg", lies=lies)) == lies
     rows = np.asarray(exif.turn_upright(stored, lies)).tolist()
@@ -157,12 +157,12 @@ def test_a_picture_is_turned_upright_from_each_of_the_eight_ways_to_lie(tmp_path
 
 
 @pytest.mark.parametrize("lies", [None, 0, 9, "6", (1, 2)])
-def test_an_orientation_that_is_none_leaves_the_picture_as_it_is(lies):
+def test_an_invalid_orientation_leaves_the_picture_unchanged(lies):
     assert exif.read_orientation({} if lies is None else {ORIENTATION: lies}) is None
 
 
 @pytest.mark.parametrize("nonsense", [0.0, -1.0, math.inf, math.nan])
-def test_a_lens_that_cannot_be_is_refused(nonsense):
+def test_an_impossible_lens_is_refused(nonsense):
     with pytest.raises(StereoweaveError, match="must be positive"):
         exif.Lens(focal_px=nonsense)
     with pytest.raises(StereoweaveError, match="must be positive"):

@@ -8,12 +8,12 @@ from stereoweave.io import files, images, maps
 
 @pytest.fixture
 def picture():
-    """Smooth, so that JPEG keeps it, and different in every channel and direction."""
+    """Return an image that is smooth, so that JPEG keeps it, and differs in every channel and direction."""
     y, x = np.mgrid[:40, :48]
     return np.stack([5 * x, 6 * y, 255 - 2 * x - 2 * y], axis=-1).astype(np.uint8)
 
 
-def test_a_file_takes_its_name_only_when_it_is_whole(tmp_path):
+def test_a_file_gets_its_name_only_when_it_is_complete(tmp_path):
     target = tmp_path / "out.txt"
     target.write_text("old")
     with files.replacing(target) as temporary:
@@ -25,7 +25,7 @@ def test_a_file_takes_its_name_only_when_it_is_whole(tmp_path):
 
 
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
-def test_an_error_leaves_what_was_there_and_nothing_else(tmp_path, error):
+def test_an_error_leaves_the_earlier_file_and_nothing_else(tmp_path, error):
     target = tmp_path / "out.txt"
     target.write_text("old")
     with pytest.raises(error), files.replacing(target) as temporary:
@@ -35,7 +35,7 @@ def test_an_error_leaves_what_was_there_and_nothing_else(tmp_path, error):
     assert list(tmp_path.iterdir()) == [target]
 
 
-def test_a_written_file_may_be_read_by_the_same_people_as_any_other(tmp_path, picture):
+def test_a_written_file_has_the_usual_permissions(tmp_path, picture):
     (tmp_path / "plain").touch()
     images.write_image(tmp_path / "picture.png", picture)
     assert (tmp_path / "picture.png").stat().st_mode == (tmp_path / "plain").stat().st_mode
@@ -47,7 +47,7 @@ def test_missing_folders_are_made(tmp_path, picture):
 
 
 @pytest.mark.parametrize("folder", ["occupied", "occupied/below"])
-def test_a_file_in_the_place_of_the_output_folder_is_named(tmp_path, picture, folder):
+def test_an_output_folder_that_is_a_file_is_named(tmp_path, picture, folder):
     (tmp_path / "occupied").write_text("a file")
     for function, arguments in [
         (files.make_folder, ()),
@@ -64,7 +64,7 @@ def test_a_file_in_the_place_of_the_output_folder_is_named(tmp_path, picture, fo
     assert (tmp_path / "occupied").read_text() == "a file"
 
 
-def test_a_folder_in_the_place_of_the_output_is_named(tmp_path, picture):
+def test_an_output_that_is_a_folder_is_named(tmp_path, picture):
     (tmp_path / "out.png").mkdir()
     message = refusal_of(images.write_image, tmp_path / "out.png", picture, kind=StereoweaveError)
     assert message.endswith("found a folder")

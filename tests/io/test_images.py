@@ -12,7 +12,7 @@ from stereoweave.io import images
 
 @pytest.fixture
 def picture():
-    """Smooth, so that JPEG keeps it, and different in every channel and direction."""
+    """Return an image that is smooth, so that JPEG keeps it, and differs in every channel and direction."""
     y, x = np.mgrid[:40, :48]
     return np.stack([5 * x, 6 * y, 255 - 2 * x - 2 * y], axis=-1).astype(np.uint8)
 
@@ -21,7 +21,7 @@ def picture():
 
 
 @pytest.mark.parametrize("ending", ["png", "tiff", "bmp", "PNG"])
-def test_a_picture_comes_back_as_it_was_written(tmp_path, picture, ending):
+def test_a_lossless_picture_is_read_back_unchanged(tmp_path, picture, ending):
     path = tmp_path / f"picture.{ending}"
     images.write_image(path, picture)
     image = images.read_image(path)
@@ -30,7 +30,7 @@ def test_a_picture_comes_back_as_it_was_written(tmp_path, picture, ending):
 
 
 @pytest.mark.parametrize("ending", ["jpg", "jpeg", "webp"])
-def test_a_picture_of_few_bytes_comes_back_nearly(tmp_path, picture, ending):
+def test_a_lossy_picture_is_read_back_nearly_unchanged(tmp_path, picture, ending):
     images.write_image(tmp_path / f"picture.{ending}", picture)
     assert np.abs(images.read_image(tmp_path / f"picture.{ending}").astype(int) - picture).max() < 12
 
@@ -48,7 +48,7 @@ def test_a_grey_picture_has_three_equal_channels(tmp_path, picture):
 
 
 @pytest.mark.parametrize("alpha", [0, 128, 255])
-def test_alpha_is_dropped_whatever_it_is(tmp_path, picture, alpha):
+def test_any_alpha_is_dropped(tmp_path, picture, alpha):
     rgba = np.dstack([picture, np.full(picture.shape[:2], alpha, np.uint8)])
     Image.fromarray(rgba).save(tmp_path / "rgba.png")
     np.testing.assert_array_equal(images.read_image(tmp_path / "rgba.png"), picture)
@@ -65,7 +65,7 @@ def test_sixteen_bit_grey_keeps_the_upper_byte(tmp_path, ending):
 
 
 @pytest.mark.parametrize(("scale", "shift"), [(1, 0), (257, 8)])
-def test_grey_of_32_bits_is_taken_for_the_8_or_16_that_it_holds(tmp_path, scale, shift):
+def test_32_bit_grey_is_read_as_the_8_or_16_bits_that_it_holds(tmp_path, scale, shift):
     values = np.tile(np.arange(256, dtype=np.int32) * scale, (40, 1))
     Image.fromarray(values).save(tmp_path / "grey.tiff")
     np.testing.assert_array_equal(images.read_image(tmp_path / "grey.tiff")[..., 1], values >> shift)
@@ -103,7 +103,7 @@ def test_a_palette_picture_shows_its_colours(tmp_path, transparency):
 
 def test_a_picture_is_turned_upright(tmp_path, picture):
     exif = Image.Exif()
-    exif[0x0112] = 6  # to be shown turned clockwise by 90 degrees
+    exif[0x0112] = 6  # rotate clockwise by 90 degrees for display
     Image.fromarray(picture).save(tmp_path / "turned.png", exif=exif)
     np.testing.assert_array_equal(images.read_image(tmp_path / "turned.png"), np.rot90(picture, -1))
 
@@ -119,7 +119,7 @@ def test_a_truncated_picture_is_an_error(tmp_path, rng, options):
 
 
 @pytest.mark.parametrize("kind", ["PNG", "JPEG"])
-def test_wherever_a_picture_is_cut_it_never_comes_back_changed(tmp_path, picture, kind):
+def test_a_picture_cut_anywhere_is_never_read_with_changed_pixels(tmp_path, picture, kind):
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     Image.fromarray(picture).save(whole, kind)
     content, expected = whole.read_bytes(), images.read_image(whole)
@@ -130,19 +130,19 @@ def test_wherever_a_picture_is_cut_it_never_comes_back_changed(tmp_path, picture
             np.testing.assert_array_equal(images.read_image(cut), expected)
         except FormatError:
             errors += 1
-    assert errors > len(content) - 32  # what a PNG has after its pixels may be missing
+    assert errors > len(content) - 32  # the part of a PNG after its pixels may be missing
 
 
-def test_a_missing_picture_names_itself(tmp_path):
+def test_a_missing_picture_is_named(tmp_path):
     assert refusal_of(images.read_image, tmp_path / "none.png").endswith("found no such file")
 
 
-def test_a_folder_is_no_picture(tmp_path):
+def test_a_folder_is_refused_as_a_picture(tmp_path):
     assert refusal_of(images.read_image, tmp_path).endswith("found a folder")
 
 
 @pytest.mark.parametrize("content", [b"", b"hello", b"cam0=[994.978 0 311.193]\n", b"\x89PNG\r\n\x1a\n"])
-def test_what_is_no_picture_is_named(tmp_path, content):
+def test_a_file_that_is_not_a_picture_is_named(tmp_path, content):
     (tmp_path / "picture.png").write_bytes(content)
     assert refusal_of(images.read_image, tmp_path / "picture.png").endswith("found something else")
 

@@ -11,7 +11,7 @@ from stereoweave.io import images, maps
 
 @pytest.fixture
 def picture():
-    """Smooth, so that JPEG keeps it, and different in every channel and direction."""
+    """Return an image that is smooth, so that JPEG keeps it, and differs in every channel and direction."""
     y, x = np.mgrid[:40, :48]
     return np.stack([5 * x, 6 * y, 255 - 2 * x - 2 * y], axis=-1).astype(np.uint8)
 
@@ -59,12 +59,12 @@ def test_opencv_reads_the_same_pfm(tmp_path, rng):
         (b"Pf\n2 2\nx\n" + bytes(16), "could not convert"),
     ],
 )
-def test_what_is_no_pfm_is_refused(tmp_path, content, found):
+def test_a_file_that_is_not_a_pfm_is_refused(tmp_path, content, found):
     (tmp_path / "map.pfm").write_bytes(content)
     assert found in refusal_of(maps.read_pfm, tmp_path / "map.pfm")
 
 
-def test_a_missing_pfm_names_itself(tmp_path):
+def test_a_missing_pfm_is_named(tmp_path):
     assert refusal_of(maps.read_pfm, tmp_path / "map.pfm").endswith("found no such file")
 
 
@@ -88,7 +88,7 @@ def test_a_disparity_of_zero_does_not_become_unknown(tmp_path):
     np.testing.assert_array_equal(stored(tmp_path / "disparity.png"), [[1, 1, 1]])
 
 
-def test_a_disparity_png_comes_back_within_half_a_step(tmp_path, rng):
+def test_a_disparity_png_is_read_back_within_half_a_step(tmp_path, rng):
     disparity_px = rng.uniform(0.01, 255.99, (30, 40)).astype(np.float32)
     disparity_px[3, 4] = np.nan
     maps.write_disparity_png(tmp_path / "disparity.png", disparity_px)
@@ -103,7 +103,7 @@ def test_a_map_without_a_known_pixel_is_written_as_unknown(tmp_path):
 
 
 @pytest.mark.parametrize(("wrong_px", "found"), [(-0.5, "-0.500 to 9.000"), (256.0, "9.000 to 256.000")])
-def test_a_disparity_that_a_png_cannot_hold_leaves_none(tmp_path, wrong_px, found):
+def test_a_disparity_that_a_png_cannot_hold_leaves_no_file(tmp_path, wrong_px, found):
     disparity_px = np.array([[wrong_px, 9.0, np.nan]])
     path = tmp_path / "disparity.png"
     assert f"found {found}" in refusal_of(maps.write_disparity_png, path, disparity_px, kind=maps.RangeError)
@@ -121,7 +121,7 @@ def test_a_depth_png_holds_millimetres_and_unknown_as_0(tmp_path):
     np.testing.assert_array_equal(stored(tmp_path / "depth.png"), [[1000, 2346, 65535], [0, 0, 0]])
 
 
-# Numbers in pictures
+# Stored values of pictures
 
 
 @pytest.mark.parametrize(
@@ -133,7 +133,7 @@ def test_a_depth_png_holds_millimetres_and_unknown_as_0(tmp_path):
         ("RGB", np.array([[[1, 2, 3], [255, 0, 128]]], np.uint8)),
     ],
 )
-def test_numbers_come_back_as_they_are_stored(tmp_path, mode, values):
+def test_stored_values_are_read_unchanged(tmp_path, mode, values):
     path = tmp_path / "numbers.png"
     Image.fromarray(values).save(path)
     read = maps.read_pixels(path, "other", mode)
@@ -141,7 +141,7 @@ def test_numbers_come_back_as_they_are_stored(tmp_path, mode, values):
     np.testing.assert_array_equal(read, values)
 
 
-def test_numbers_in_a_picture_of_another_kind_are_refused(tmp_path, picture):
+def test_stored_values_of_another_mode_are_refused(tmp_path, picture):
     images.write_image(tmp_path / "colour.png", picture)
     assert "mode L or 1, found PNG of mode RGB" in refusal_of(
         maps.read_pixels, tmp_path / "colour.png", "L", "1"

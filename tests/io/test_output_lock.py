@@ -1,4 +1,4 @@
-"""One writer at a time: what a second one is told, and what is left of one that is killed."""
+"""Only one process at a time writes to an output: a second one is refused, and a killed one holds no lock."""
 
 import errno
 import fcntl
@@ -26,7 +26,7 @@ with lock_output(Path(sys.argv[1])):
 
 @contextmanager
 def held(output: Path) -> Iterator["subprocess.Popen[str]"]:
-    """Another process that holds the lock of an output; at the end of the block it lets it go."""
+    """Run another process that holds the lock of an output until the end of the block."""
     command = [sys.executable, "-c", PROGRAM, output]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout.readline() == "locked\n"
@@ -45,13 +45,13 @@ def assert_in_use(output: Path) -> None:
 
 @pytest.fixture
 def folder(tmp_path):
-    """A folder and a link to it."""
+    """Return a folder and a link to it."""
     (tmp_path / "sets").mkdir()
     (tmp_path / "link").symlink_to("sets")
     return tmp_path / "sets"
 
 
-def test_a_second_writer_is_refused_whatever_it_calls_the_folder(folder, monkeypatch):
+def test_a_second_writer_is_refused_for_every_path_of_the_folder(folder, monkeypatch):
     with held(folder):
         monkeypatch.chdir(folder)
         for spelling in (folder, folder.parent / "link", folder / "no" / "..", Path(), Path("../sets/.")):
@@ -63,7 +63,7 @@ def test_a_second_writer_is_refused_whatever_it_calls_the_folder(folder, monkeyp
     assert not list(folder.iterdir())
 
 
-def test_a_second_writer_is_refused_whatever_it_calls_the_file(folder, monkeypatch):
+def test_a_second_writer_is_refused_for_every_path_of_the_file(folder, monkeypatch):
     film = folder / "film.mp4"
     with held(film):
         monkeypatch.chdir(folder)
@@ -78,7 +78,7 @@ def test_a_second_writer_is_refused_whatever_it_calls_the_file(folder, monkeypat
     assert [path.name for path in folder.iterdir()] == ["other.mp4"]
 
 
-def test_a_killed_writer_leaves_no_lock_and_the_next_one_no_file(folder):
+def test_a_killed_writer_leaves_no_lock_and_the_next_writer_no_lock_file(folder):
     with held(folder) as process:
         process.kill()
         process.wait()
@@ -94,7 +94,7 @@ def test_a_lock_ends_with_an_error_and_the_folder_of_a_new_file_is_made(tmp_path
     assert not list(film.parent.iterdir())
 
 
-def test_where_a_lock_cannot_be_written_one_line_says_so(tmp_path):
+def test_a_lock_that_cannot_be_written_is_a_one_line_error(tmp_path):
     (tmp_path / ".lock").mkdir()
     expected = r"\.lock: expected a file that can be written, found .*; remove it$"
     with pytest.raises(StereoweaveError, match=expected), lock_output(tmp_path):
@@ -116,7 +116,7 @@ def refuse_locks(monkeypatch: pytest.MonkeyPatch, reason: int) -> None:
     monkeypatch.setattr(fcntl, "flock", refuse)
 
 
-def test_nobody_is_sent_to_remove_a_lock_where_that_would_not_help(tmp_path, monkeypatch):
+def test_removing_a_lock_is_advised_only_where_it_helps(tmp_path, monkeypatch):
     refuse_locks(monkeypatch, errno.EIO)
     with pytest.raises(StereoweaveError, match="found input/output error$"), lock_output(tmp_path):
         pass
@@ -125,7 +125,7 @@ def test_nobody_is_sent_to_remove_a_lock_where_that_would_not_help(tmp_path, mon
 @pytest.mark.parametrize(
     "reason", [errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP, errno.EINVAL]
 )
-def test_a_disk_without_locks_is_written_to_all_the_same(tmp_path, monkeypatch, reason):
+def test_a_disk_without_locks_is_written_to_without_a_lock(tmp_path, monkeypatch, reason):
     refuse_locks(monkeypatch, reason)
     with lock_output(tmp_path):
         (tmp_path / "result").touch()

@@ -16,14 +16,14 @@ from stereoweave.io.stores import Store, store_at
 
 @pytest.fixture(params=["disk", "s3"])
 def store(request, tmp_path) -> Store:
-    """A new folder, on a disk and in an object store."""
+    """Return the store of a new folder, on a disk or in an object store."""
     place = tmp_path / "disk" if request.param == "disk" else f"{request.getfixturevalue('bucket')}/of/ours"
     return store_at(place)
 
 
 @contextmanager
 def another_environment(monkeypatch, **settings: str) -> Iterator[None]:
-    """Connections are made anew inside, and after it as well."""
+    """Drop cached connections before and after the block, so that its environment variables take effect."""
     from s3fs import S3FileSystem
 
     with monkeypatch.context() as patch:
@@ -67,10 +67,10 @@ def error_of(action) -> str:
     return str(told.value)
 
 
-# What both kinds do
+# Behaviour of both kinds of stores
 
 
-def test_what_is_written_is_listed_and_read(store, tmp_path):
+def test_a_written_file_is_listed_and_read(store, tmp_path):
     store.check_destination()
     picture = tmp_path / "picture.png"
     picture.write_bytes(b"pixels")
@@ -84,7 +84,7 @@ def test_what_is_written_is_listed_and_read(store, tmp_path):
     assert (fetched == tmp_path / "disk/a/left [1]#?.png") == (store.folder is not None)
 
 
-def test_a_folder_in_it_is_listed_by_paths_of_the_whole(store):
+def test_a_subfolder_is_listed_with_paths_from_the_store_s_folder(store):
     for path in ("parts/1.parquet", "parts/2.parquet", "partsof/3.parquet", "1.parquet"):
         store.write_bytes(path, b"")
     assert sorted(file.path for file in store.files("parts")) == ["parts/1.parquet", "parts/2.parquet"]
@@ -116,14 +116,14 @@ def test_a_removed_file_is_gone_and_may_be_removed_again(store):
     assert not store.exists("a/b")
 
 
-def test_a_source_that_is_not_there_is_told_in_a_line(store):
+def test_a_missing_source_is_a_one_line_error(store):
     assert list(store.files()) == []
     assert error_of(store.check_source).startswith(f"{store.place}: expected a folder, found no")
     store.write_bytes("a", b"")
     store.check_source()
 
 
-def test_a_file_that_is_not_there_is_told_by_its_whole_name(store, tmp_path):
+def test_a_missing_file_is_named_in_full(store, tmp_path):
     store.check_destination()
     assert error_of(lambda: store.read_bytes("a/b")).startswith(f"{store.at('a/b')}: expected a file")
     assert not list(tmp_path.rglob("b"))
@@ -159,7 +159,7 @@ def test_a_file_that_is_removed_while_it_is_listed_is_left_out(tmp_path):
     assert stores._read_status(entry) is None
 
 
-def test_a_path_needs_none_of_the_libraries_of_stores(tmp_path):
+def test_a_path_needs_no_library_for_object_stores(tmp_path):
     program = (
         "import json, sys; from stereoweave.io.stores import store_at\n"
         "store_at(sys.argv[1]).check_destination()\n"
@@ -181,7 +181,7 @@ def test_more_files_than_a_page_holds_are_all_listed_once(bucket, monkeypatch):
     assert [file.path for file in store.files()] == names
 
 
-def test_the_empty_object_of_a_folder_and_one_named_like_the_beginning_are_no_files_of_it(bucket, s3):
+def test_a_folder_s_marker_and_an_object_with_its_name_as_prefix_are_not_listed(bucket, s3):
     for path in ("a/", "a/b/", "a/b/c.png", "ab.png", "a"):
         put_object(s3, f"{bucket[5:]}/{path}")
     assert [file.path for file in store_at(f"{bucket}/a/").files()] == ["b/c.png"]
@@ -193,7 +193,7 @@ def test_a_path_that_leads_out_of_the_folder_is_not_listed(bucket, s3):
     assert list(store_at(bucket).files()) == []
 
 
-def test_a_wrong_bucket_is_told_by_its_name(s3, tmp_path):
+def test_a_missing_bucket_is_named(s3, tmp_path):
     store = store_at("s3://nobodys-bucket/pairs")
     for check in (store.check_source, store.check_destination):
         message = error_of(check)
@@ -206,7 +206,7 @@ def test_a_wrong_bucket_is_told_by_its_name(s3, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_keys_that_are_nobody_s_and_ones_that_may_not_are_told(bucket, s3, monkeypatch):
+def test_unknown_keys_and_keys_without_permission_are_reported(bucket, s3, monkeypatch):
     store = store_at(bucket)
     keys = keys_that_allow_nothing()
     with with_permissions_checked(s3):
@@ -225,14 +225,14 @@ def test_keys_that_are_nobody_s_and_ones_that_may_not_are_told(bucket, s3, monke
             assert "found no permission (" in error_of(lambda: store.exists("a"))
 
 
-def test_missing_keys_are_told_with_the_variables_that_hold_them(bucket, monkeypatch):
+def test_missing_keys_are_reported_with_their_environment_variables(bucket, monkeypatch):
     with another_environment(monkeypatch), monkeypatch.context() as patch:
         patch.delenv("AWS_ACCESS_KEY_ID")
         message = error_of(store_at(bucket).check_source)
     assert "found no usable keys (Unable to locate credentials); set AWS_ACCESS_KEY_ID" in message
 
 
-def test_an_endpoint_where_nobody_listens_is_told(bucket, monkeypatch):
+def test_an_endpoint_that_refuses_connections_is_reported(bucket, monkeypatch):
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         endpoint = f"http://127.0.0.1:{taken.getsockname()[1]}"
@@ -242,7 +242,7 @@ def test_an_endpoint_where_nobody_listens_is_told(bucket, monkeypatch):
     assert message.endswith("check the network and AWS_ENDPOINT_URL")
 
 
-def test_an_endpoint_that_says_nothing_is_given_up_in_seconds(bucket, monkeypatch):
+def test_an_endpoint_that_does_not_answer_fails_within_seconds(bucket, monkeypatch):
     monkeypatch.setattr("stereoweave.io.stores._ANSWER_S", 0.2)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         endpoint = f"http://127.0.0.1:{silent.getsockname()[1]}"
@@ -250,7 +250,7 @@ def test_an_endpoint_that_says_nothing_is_given_up_in_seconds(bucket, monkeypatc
             assert "found no answer (" in error_of(store_at(bucket).check_source)
 
 
-# Places that are none
+# Invalid places
 
 
 @pytest.mark.parametrize(
@@ -263,7 +263,7 @@ def test_an_endpoint_that_says_nothing_is_given_up_in_seconds(bucket, monkeypatc
         ("s3:///pairs", "expected s3://bucket/folder, found no bucket"),
     ],
 )
-def test_a_url_of_no_store_is_told(place, found):
+def test_a_url_of_an_unknown_store_is_refused(place, found):
     message = error_of(lambda: store_at(place))
     assert message.startswith(f"{place}: expected ")
     assert found in message
@@ -279,7 +279,7 @@ def test_a_store_whose_library_is_missing_names_the_extra(place, library, monkey
     assert "install the extra 'cluster'" in message
 
 
-def test_an_account_of_azure_that_is_not_named_is_told_with_the_variables(monkeypatch):
+def test_a_missing_azure_account_is_reported_with_its_environment_variables(monkeypatch):
     monkeypatch.delenv("AZURE_STORAGE_ACCOUNT_NAME", raising=False)
     monkeypatch.delenv("AZURE_STORAGE_CONNECTION_STRING", raising=False)
     message = error_of(store_at("az://container/pairs").check_source)
@@ -287,7 +287,7 @@ def test_an_account_of_azure_that_is_not_named_is_told_with_the_variables(monkey
     assert "AZURE_STORAGE_ACCOUNT_NAME" in message
 
 
-def test_a_folder_that_may_not_be_written_is_told(tmp_path):
+def test_a_folder_without_write_permission_is_reported(tmp_path):
     (tmp_path / "file").touch()
     assert "found a file" in error_of(store_at(tmp_path / "file").check_destination)
     assert "found a file" in error_of(store_at(tmp_path / "file").check_source)

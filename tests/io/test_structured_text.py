@@ -8,7 +8,7 @@ from stereoweave.io.structured_text import parse_entries
 
 KINDS = ["yml", "xml", "json"]
 WAYS = [0, cv2.FileStorage_WRITE_BASE64]
-# OpenCV does not write those of 16 bits in base64.
+# OpenCV does not write 16-bit floats in base64.
 TYPES = [np.float64, np.float32, np.float16, np.int32, np.int16, np.uint16, np.int8, np.uint8]
 
 
@@ -22,7 +22,7 @@ def read_by_opencv(text, name):
 
 
 def as_numbers(value):
-    """The value with floats in place of what can be one."""
+    """Return the value with strings converted to floats where possible."""
     if isinstance(value, dict):
         return {name: as_numbers(entry) for name, entry in value.items()}
     if isinstance(value, list):
@@ -38,7 +38,7 @@ def as_numbers(value):
     ("number", "flags"),
     [(number, flags) for number in TYPES for flags in WAYS if (number, flags) != (np.float16, WAYS[1])],
 )
-def test_matrices_of_every_type_are_what_opencv_reads(tmp_path, kind, flags, number):
+def test_matrices_of_every_type_are_read_as_opencv_reads_them(tmp_path, kind, flags, number):
     rng = np.random.default_rng(3)
     matrix = np.diag([*rng.uniform(50, 120, 2), 1]).astype(number)
     matrix[0, 2], matrix[1, 2] = 100, 90
@@ -48,7 +48,7 @@ def test_matrices_of_every_type_are_what_opencv_reads(tmp_path, kind, flags, num
         storage.write(f"M{side}", matrix)
         storage.write(f"D{side}", distortion.reshape(5, 1))
     storage.write("R", np.eye(3).astype(number))
-    storage.write("T", np.array([[[1, 2, 3]]], number))  # three channels of one place
+    storage.write("T", np.array([[[1, 2, 3]]], number))  # one element with three channels
     text = storage.releaseAndGetString()
     (tmp_path / "calib").write_text(text)
     rig = read_rig(tmp_path / "calib")
@@ -71,7 +71,7 @@ def test_a_rig_that_opencv_writes_is_read_bit_by_bit(tmp_path, kind, flags):
         storage.write(f"distCoeffs{side}", rng.normal(0, 1e-7, (1, 14)) if side == "1" else np.zeros((1, 4)))
     storage.writeComment("behind it", True)
     storage.write("R", rotation)
-    storage.write("T", translation_m)  # of one dimension
+    storage.write("T", translation_m)  # one-dimensional
     storage.write("translation_unit", "m")
     storage.write("distortion_model", "plumb bob")
     storage.write("points", rng.normal(0, 1, (50, 1, 2)).astype(np.float32))
@@ -112,7 +112,7 @@ def test_lenses_without_distortion_may_have_an_empty_matrix(tmp_path, kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_maps_sequences_and_words_of_opencv_are_the_same_in_all_its_formats(kind):
+def test_opencv_s_maps_sequences_and_strings_are_the_same_in_all_its_formats(kind):
     storage = written(kind)
     storage.write("count", 640)
     storage.write("small", -1e-05)
@@ -147,12 +147,12 @@ def test_maps_sequences_and_words_of_opencv_are_the_same_in_all_its_formats(kind
 @pytest.mark.parametrize(
     "text", ["", "[1, 2]", "a word", "<opencv_storage/>", "<svg/>", "{", "a: *b", "a: [1"]
 )
-def test_what_has_no_entries_with_names_is_refused(text):
+def test_text_without_named_entries_is_refused(text):
     with pytest.raises((ValueError, SyntaxError)):
         parse_entries(text)
 
 
-def test_values_are_strings_whatever_their_tags_and_looks_say():
+def test_values_are_strings_with_any_tag_or_form():
     text = "a: 1\nb: 2001-01-01\nc: !!int 2\nd: '~'\ne: !!python/name:os.system\nf: yes\n<<: {g: 1:59}\n"
     assert parse_entries(text) == {
         **{"a": "1", "b": "2001-01-01", "c": "2", "d": "~", "e": "", "f": "yes"},
@@ -160,7 +160,7 @@ def test_values_are_strings_whatever_their_tags_and_looks_say():
     }
 
 
-def test_entries_of_null_are_left_out_and_nulls_elsewhere_stay_words():
+def test_null_entries_are_left_out_and_nulls_elsewhere_are_strings():
     text = "a: ~\nb: null\nc:\nd: ''\ne: {f: NULL, g: [~, null]}\n"
     assert parse_entries(text) == {"d": "", "e": {"g": ["~", "null"]}}
     assert parse_entries('{"a": null, "b": "null"}') == {"b": "null"}

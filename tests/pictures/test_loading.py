@@ -568,10 +568,10 @@ def box(*brands):
 @pytest.mark.parametrize(
     ("name", "content", "found"),
     [
-        ("a.heic", box(b"heic", b"mif1", b"heic"), "HEIC, such as a spatial photograph"),
-        ("a.jpg", box(b"mif1", b"heic"), "HEIC, such as a spatial photograph"),
+        ("a.heic", box(b"heic", b"mif1", b"heic"), "HEIC, the format of spatial photographs"),
+        ("a.jpg", box(b"mif1", b"heic"), "HEIC, the format of spatial photographs"),
         # In the file's head, after the version of the first brand, are 12 others.
-        ("a.jpg", box(b"isom", *[b"iso2"] * 11, b"heic"), "HEIC, such as a spatial photograph"),
+        ("a.jpg", box(b"isom", *[b"iso2"] * 11, b"heic"), "HEIC, the format of spatial photographs"),
         ("a.mov", box(b"qt  "), "a video; 'stereoweave video'"),
         ("a.mkv", b"\x1a\x45\xdf\xa3", "a video; 'stereoweave video'"),
         ("a.CR2", b"II\x2a\0", "a camera's raw file"),

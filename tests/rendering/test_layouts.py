@@ -252,9 +252,9 @@ def test_a_layout_is_known_by_its_name_or_by_the_ending_of_the_file(path, name, 
         ("view.png", "quild", "side_by_side, .*, quilt, .*, wiggle, found 'quild'"),
         ("view.mpo", "crossed", r"view\.mpo: expected the layout side_by_side .* found crossed"),
         ("view.jps", "quilt", r"view\.jps: expected the layout crossed .* found quilt"),
-        ("view.png", "wiggle", r"view\.png: expected the ending of an animation, \.mp4, \.gif, \.webp"),
-        ("view.gif", "quilt", r"view\.gif: expected a picture file ending, \.png"),
-        ("view.mp4", None, r"view\.mp4: expected a picture file ending, \.png"),
+        ("view.png", "wiggle", r"view\.png: expected one of the animation file endings \.mp4, \.gif, \.webp"),
+        ("view.gif", "quilt", r"view\.gif: expected a picture file ending \(\.png"),
+        ("view.mp4", None, r"view\.mp4: expected a picture file ending \(\.png"),
     ],
 )
 def test_an_unknown_layout_or_an_ending_that_does_not_fit_it_is_told(path, name, expected):

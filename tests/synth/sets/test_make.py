@@ -277,7 +277,7 @@ def test_the_paper_s_folders_refuse_a_sample_without_a_camera(frame):
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"spec": replace(SPEC, seed=4)}, "expected seed = 4, as this run would make, found 3"),
+        ({"spec": replace(SPEC, seed=4)}, "expected seed = 4 for this run, found 3"),
         ({"spec": replace(SPEC, size_px=(64, 32))}, "expected size_px = [64, 32]"),
         ({"spec": replace(SPEC, frames=2)}, "expected frames = 2"),
         ({"spec": replace(SPEC, views=(0.25,))}, "expected views = [0.25]"),
@@ -295,10 +295,10 @@ def test_a_folder_with_another_set_is_refused_and_left_unchanged(finished, chang
 
 def test_a_set_of_another_version_or_renderer_is_refused(finished, monkeypatch):
     monkeypatch.setattr(making, "generator_version", lambda: "89abcdef")
-    assert 'expected generator = "89abcdef", as this run would make' in error_of(made, finished)
+    assert 'expected generator = "89abcdef" for this run' in error_of(made, finished)
     prepare(monkeypatch)
     monkeypatch.setattr(PaintedPairMaker, "renderer", lambda self: "oil")
-    assert 'expected renderer = "oil", as this run would make, found "paint"' in error_of(made, finished)
+    assert 'expected renderer = "oil" for this run, found "paint"' in error_of(made, finished)
 
 
 @pytest.mark.parametrize("text", ['{"format": 2, "layout": "shards"}', "[1]", "{"])
