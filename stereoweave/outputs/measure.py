@@ -9,14 +9,15 @@ from jaxtyping import Float64
 from stereoweave.errors import StereoweaveError
 from stereoweave.stereo import Estimate, StereoCamera
 
-# The probability that the stated uncertainty holds: that of one standard deviation of a normal distribution.
+# Probability that an error is within the stated uncertainty, as for one standard deviation of a normal
+# distribution.
 HOLDS = 0.6827
-# Pixels in this window around a pixel, with a disparity within this of its own, are on the same surface.
+# Pixels in this window around a pixel are on its surface if their disparities differ by at most this.
 _WINDOW_PX = 5
 _SAME_SURFACE_PX = 1.0
 _LEAST_CONFIDENCE = 0.5
-# Corresponds to an error of 0.15 px. Where the shipped networks are more confident than this, 68 % of their
-# errors on painted pairs are below 0.10 and 0.16 px.
+# Corresponds to an error of 0.15 px. Where the two shipped networks are more confident than this, 68 % of
+# their errors on painted pairs are below 0.10 px and 0.16 px.
 _MOST_CONFIDENT = 0.9995
 
 
@@ -39,7 +40,7 @@ EXACT = CameraError()
 class Measurement:
     """Distance between two points; its error is below uncertainty_m with a probability of 68 %.
 
-    first_m and second_m are the points in metres: x right, y down, z forward of the left camera.
+    first_m and second_m are the points in metres, in the left camera's axes: x right, y down, z forward.
     """
 
     distance_m: float
@@ -48,7 +49,7 @@ class Measurement:
     second_m: tuple[float, float, float]
 
     def __str__(self) -> str:
-        """Format as 1.234 m ± 0.012 m (68 %): uncertainty with two digits, distance with as many decimals."""
+        """Format as 1.234 m ± 0.012 m (68 %), with two significant digits of uncertainty."""
         digits = 1 - math.floor(math.log10(self.uncertainty_m)) if self.uncertainty_m > 0 else 6
         digits = min(max(digits, 0), 6)
         return f"{self.distance_m:.{digits}f} m ± {self.uncertainty_m:.{digits}f} m (68 %)"
@@ -70,22 +71,22 @@ def distance(
 
         sigma_d = ln(1 - 0.6827) / ln(1 - p)
 
-    and 90 % below twice that. The points are P = B / (d + doffs) * (x - cx, y - cy, f). An error of the
-    disparity moves the point by -P / (d + doffs) per pixel; the distance D changes by the component along the
-    line between the points. A relative error of the baseline changes D by the same share, one of the focal
-    length by its share times (difference of depth / D)^2. The contributions are added in quadrature. cx, cy,
-    doffs and the pixel coordinates are taken as exact.
+    and 90 % are below twice this bound. The points are P = B / (d + doffs) * (x - cx, y - cy, f). A disparity
+    error moves a point by -P / (d + doffs) per pixel; the component along the line between the points changes
+    the distance D. A relative baseline error changes D by the same fraction. A relative focal length error
+    changes D by that fraction times (depth difference / D)^2. The contributions are added in quadrature. cx,
+    cy, doffs and the pixel coordinates are taken as exact.
 
     Args:
         estimate: The pair's estimate.
         camera: The pair's camera.
         first_px: Column and row of a pixel in the left image.
-        second_px: Column and row of another one.
+        second_px: Column and row of another pixel.
         camera_error: Relative uncertainty of the camera.
 
     Raises:
-        StereoweaveError: A pixel is outside the image, its depth is unknown or infinite, or both are the
-            same.
+        StereoweaveError: A pixel is outside the image, its depth is unknown or infinite, or the two pixels
+            are the same.
     """
     if tuple(first_px) == tuple(second_px):
         raise StereoweaveError(f"expected two different pixels, found {_format_pixel(first_px)} twice")
@@ -110,7 +111,7 @@ def distance(
 
 
 def disparity_error_px(confidence: float) -> float:
-    """Bound of 68 % of the disparity errors, from the probability that an error is below 1 px."""
+    """Return the bound, in px, that 68 % of disparity errors at this confidence stay below."""
     return math.log(1 - HOLDS) / math.log(1 - min(confidence, _MOST_CONFIDENT))
 
 
@@ -128,7 +129,7 @@ def _find_point_m(
     shift_px = float(np.median(around_px[same])) + camera.doffs_px
     if shift_px <= 0:
         raise StereoweaveError(
-            f"pixel {_format_pixel(pixel_px)}: expected a finite depth, found one at infinity; "
+            f"pixel {_format_pixel(pixel_px)}: expected a finite depth, found a point at infinity; "
             "choose a nearer point"
         )
     ray = np.array([column - camera.cx_px, row - camera.cy_px, camera.focal_px], np.float64)
@@ -142,19 +143,19 @@ def _check_pixel(estimate: Estimate, pixel_px: tuple[int, int]) -> tuple[int, in
     column, row = pixel_px
     if not (0 <= column < width and 0 <= row < height):
         raise StereoweaveError(
-            f"pixel {_format_pixel(pixel_px)}: expected one in the left picture, {width}x{height} px, "
-            f"from 0,0 to {width - 1},{height - 1}, found one outside"
+            f"pixel {_format_pixel(pixel_px)}: expected a pixel of the left picture, {width}x{height} px, "
+            f"from 0,0 to {width - 1},{height - 1}, found one outside it"
         )
     if estimate.occluded[row, column]:
         raise StereoweaveError(
-            f"pixel {_format_pixel(pixel_px)}: expected one that both cameras see, found an occluded one, "
-            "which only the left camera sees; choose another nearby"
+            f"pixel {_format_pixel(pixel_px)}: expected a pixel that both cameras see, found an occluded "
+            "one, which only the left camera sees; choose another pixel nearby"
         )
     confidence = float(estimate.confidence[row, column])
     if confidence < _LEAST_CONFIDENCE:
         raise StereoweaveError(
             f"pixel {_format_pixel(pixel_px)}: expected a confidence of at least "
-            f"{100 * _LEAST_CONFIDENCE:.0f} %, found {100 * confidence:.0f} %; choose another nearby"
+            f"{100 * _LEAST_CONFIDENCE:.0f} %, found {100 * confidence:.0f} %; choose another pixel nearby"
         )
     return column, row
 

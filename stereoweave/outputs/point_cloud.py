@@ -1,8 +1,8 @@
 """Coloured point clouds and meshes of a pair, and their PLY and GLB files.
 
 Arrays use the axes of computer vision, in metres: origin at the left camera, x right, y down, z forward.
-Files use the axes of 3-D viewers, in metres: x right, y up, the camera looks along -z. glTF prescribes them,
-and MeshLab, CloudCompare and Open3D show a PLY file upright with them.
+Files use the axes of 3-D viewers, in metres: x right, y up, with the camera looking along -z. glTF prescribes
+these axes; with them, MeshLab, CloudCompare and Open3D show PLY files upright.
 """
 
 from dataclasses import dataclass
@@ -25,10 +25,10 @@ NO_CAMERA = Note(
     ),
 )
 MOST_POINTS = 4_000_000
-# Largest change of disparity between neighbouring pixels of a surface that both cameras see; more is a depth
-# edge.
+# Largest disparity difference between neighbouring pixels of a surface that both cameras see; a larger one is
+# a depth edge.
 _STEEPEST_PX = 1.0
-# Half size of the window in which a mixed pixel has both a nearer and a farther neighbour.
+# Half the size of the window in which a mixed pixel has both a nearer and a farther neighbour.
 _REACH_PX = 2
 # Below this disparity + doffs, the true depth may be anything from half the estimate to infinity.
 _LEAST_SHIFT_PX = 1.0
@@ -36,7 +36,7 @@ _VIEWER_AXES = np.array([1, -1, -1], np.float32)
 
 
 class EmptyError(StereoweaveError):
-    """The pair gives no points, or no mesh."""
+    """Error for a pair from which no point or no triangle can be made."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +44,7 @@ class PointCloud:
     """Coloured point cloud.
 
     Attributes:
-        points_m: float32 [N, 3] in metres: x right, y down, z forward of the left camera.
+        points_m: float32 [N, 3] in metres, in the left camera's axes: x right, y down, z forward.
         colours: uint8 RGB [N, 3], from the left image.
         step_px: Sampling step along rows and columns.
     """
@@ -56,7 +56,7 @@ class PointCloud:
 
 @dataclass(frozen=True, kw_only=True)
 class Mesh(PointCloud):
-    """Triangle mesh; `faces`, int32 [M, 3], are vertex indices, with front sides towards the camera."""
+    """Triangle mesh; `faces`, int32 [M, 3], holds vertex indices, with front sides facing the camera."""
 
     faces: Int32[np.ndarray, "m 3"]
 
@@ -64,17 +64,17 @@ class Mesh(PointCloud):
 def make_point_cloud(
     pair: StereoPair, estimate: Estimate, *, least_confidence: float = 0.5, most_points: int = MOST_POINTS
 ) -> PointCloud:
-    """Return the point cloud of the left image's pixels of known depth (`find_reliable`).
+    """Return the point cloud of the left image's pixels with reliable depth (`find_reliable`).
 
     Args:
         pair: The pair, with its camera.
         estimate: The pair's estimate.
-        least_confidence: Least confidence of a pixel.
-        most_points: Largest number of points; more are thinned to every second, third, ... row and column.
+        least_confidence: Lowest confidence of a pixel to use.
+        most_points: Largest number of points. If there are more, only every nth row and column is used.
 
     Raises:
         StereoweaveError: The pair has no camera.
-        EmptyError: No pixel has a known depth.
+        EmptyError: No pixel has a reliable depth.
     """
     camera = require_camera(pair)
     known, step_px = _thin(find_reliable(pair, estimate, least_confidence), most_points)
@@ -84,10 +84,10 @@ def make_point_cloud(
 def make_mesh(
     pair: StereoPair, estimate: Estimate, *, least_confidence: float = 0.5, most_points: int = MOST_POINTS
 ) -> Mesh:
-    """Return the mesh through the points of `make_point_cloud`, open at depth edges; same arguments.
+    """Return the mesh through the points of `make_point_cloud`, open at depth edges.
 
-    Neighbouring pixels are joined unless their disparities differ by more than 1 px per pixel. Points that no
-    triangle uses are removed.
+    The arguments and errors are the same. Neighbouring pixels are joined unless their disparities differ by
+    more than 1 px per pixel. Points that no triangle uses are removed.
     """
     camera = require_camera(pair)
     known, step_px = _thin(find_reliable(pair, estimate, least_confidence), most_points)
@@ -108,12 +108,13 @@ def make_mesh(
 def find_reliable(
     pair: StereoPair, estimate: Estimate, least_confidence: float = 0.5
 ) -> Bool[np.ndarray, "h w"]:
-    """Mask of the left image's pixels of reliable depth.
+    """Return the mask of the left image's pixels with reliable depth.
 
-    Excluded are occluded pixels, pixels that the image does not cover, those below `least_confidence`, those
-    with a disparity + doffs below 1 px (nearly infinite depth), and mixed pixels. Matchers blur depth edges;
-    mixed pixels would float between the two surfaces. A mixed pixel has, within 2 px in its row or in its
-    column, both a neighbour nearer and one farther by more than 1 px of disparity.
+    Excluded are occluded pixels, pixels outside the image's content, pixels with a confidence below
+    `least_confidence`, pixels with a disparity + doffs below 1 px (nearly infinite depth), and mixed pixels.
+    Matchers blur depth edges, so the points of mixed pixels would float between two surfaces. A mixed pixel
+    has, within 2 px along its row or its column, one neighbour that is nearer by more than 1 px of disparity
+    and one that is farther by more than 1 px.
     """
     check_fits(estimate, pair)
     doffs_px = pair.camera.doffs_px if pair.camera else 0.0
@@ -178,8 +179,8 @@ def _thin(known: Bool[np.ndarray, "h w"], most_points: int) -> tuple[Bool[np.nda
         step_px += 1
     if not thinned.any():
         raise EmptyError(
-            "expected pixels of known depth, found none that is confident, seen by both cameras and nearer "
-            "than infinity"
+            "expected pixels of known depth, found none that are confident, seen by both cameras and not "
+            "infinitely far"
         )
     return thinned, step_px
 
@@ -191,7 +192,7 @@ def _place_points(
     places: Int[np.ndarray, "n 2"],
     step_px: int,
 ) -> PointCloud:
-    """Return the points of pixels given by row and column."""
+    """Return the point cloud of pixels that are given by row and column."""
     rows, columns = places.T
     depth_m = camera.depth_m(estimate.disparity_px[rows, columns][None])[0]
     x, y = (columns - camera.cx_px) / camera.focal_px, (rows - camera.cy_px) / camera.focal_px
@@ -202,7 +203,10 @@ def _place_points(
 def _triangulate(
     known: Bool[np.ndarray, "h w"], disparity_px: Float[np.ndarray, "h w"], most_px: float
 ) -> Int[np.ndarray, "m 3"]:
-    """Build two triangles per square of known neighbours whose disparities differ by at most `most_px`."""
+    """Return up to two triangles per square of pixels.
+
+    The corners of a triangle are known, and their disparities differ by at most `most_px`.
+    """
     number = np.cumsum(known).reshape(known.shape) - 1
     here, right, below, across = np.s_[:-1, :-1], np.s_[:-1, 1:], np.s_[1:, :-1], np.s_[1:, 1:]
     faces = []
@@ -217,7 +221,7 @@ def _triangulate(
 
 
 def _convert_to_trimesh(cloud: PointCloud) -> Any:
-    """Convert to a trimesh object in the axes of 3-D viewers."""
+    """Convert a point cloud or mesh to a trimesh object, in the axes of 3-D viewers."""
     trimesh = _import_trimesh()
     points_m = cloud.points_m * _VIEWER_AXES
     if isinstance(cloud, Mesh):
@@ -239,7 +243,7 @@ def _linearize(colours: UInt8[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3"]:
 
 
 def _mark_unlit(tree: dict[str, Any]) -> None:
-    """Mark the only material as unlit: the image contains the scene's lighting."""
+    """Mark the only material as unlit, because the colours already contain the scene's lighting."""
     tree["materials"] = [
         {
             "pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 1},

@@ -1,4 +1,4 @@
-"""Self-contained HTML report of a result: images, summary, and new views with a slider."""
+"""Self-contained HTML report on a result: images, summary, and new views with a slider."""
 
 import base64
 import html
@@ -33,11 +33,11 @@ _JPEG_QUALITY = 88
 
 @dataclass(frozen=True, kw_only=True)
 class Summary:
-    """Summary of a result. Depths are None if infinite or without a camera.
+    """Summary of a result; a depth is None if it is infinite or the camera is unknown.
 
     Attributes:
-        occluded_percent: Pixels that only the left camera sees.
-        confident_percent: Pixels with a confidence of at least 0.5.
+        occluded_percent: Share of pixels that only the left camera sees.
+        confident_percent: Share of pixels with a confidence of at least 0.5.
     """
 
     pictures: tuple[str, ...]
@@ -63,7 +63,7 @@ def summarize(
 
     Args:
         pair: The pair.
-        estimate: Its estimate.
+        estimate: The pair's estimate.
         pictures: File names of the pair.
         model: Name of the matcher.
         estimate_ms: Duration of the matching.
@@ -94,9 +94,9 @@ def write_report(
 ) -> None:
     """Write the report as a single HTML file without external resources.
 
-    It shows the left image, the depth (the disparity without a camera), the confidence, the summary, and the
-    views from POSITIONS with a slider. The longer side of an image is at most 1000 px. `threads` is the
-    number of threads for `render`.
+    The report shows the left image, the depth (or the disparity if the camera is unknown), the confidence,
+    the summary, and a slider through the views from POSITIONS. Images have at most 1000 px on the longer
+    side. `threads` is the number of threads for rendering.
     """
     source = importlib.resources.files("stereoweave.outputs") / "report.html"
     template = source.read_text(encoding="utf-8")
@@ -152,7 +152,10 @@ def _collect_fields(
 
 
 def downscale(pair: StereoPair, estimate: Estimate, longer_side_px: int) -> tuple[StereoPair, Estimate]:
-    """Downscale both for display to at most `longer_side_px`, disparities included; the camera is dropped."""
+    """Downscale a pair and its estimate for display, to at most `longer_side_px` on the longer side.
+
+    Disparities are scaled too; the camera is dropped.
+    """
     height, width = estimate.disparity_px.shape
     scale = min(1.0, longer_side_px / max(height, width))
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
@@ -170,13 +173,16 @@ def downscale(pair: StereoPair, estimate: Estimate, longer_side_px: int) -> tupl
 
 
 def _resize_nearest(values: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Resize a map to (width, height) by nearest neighbour: a mean across a depth edge lies on no surface."""
+    """Resize a map to (width, height) by nearest neighbour: means across depth edges lie on no surface."""
     numbers = values.view(np.uint8) if values.dtype == bool else values
     return cv2.resize(numbers, size, interpolation=cv2.INTER_NEAREST_EXACT).view(values.dtype)
 
 
 def _encode_disparity(estimate: Estimate) -> dict[str, object]:
-    """Encode the disparity shown at the pointer: low_px + step_px * level, with 16-bit levels in base64."""
+    """Encode the disparity that is shown at the pointer as low_px + step_px * level.
+
+    The 16-bit levels are encoded in base64.
+    """
     height, width = estimate.disparity_px.shape
     scale = min(1.0, _LONGER_SIDE_OF_MAP_PX / max(height, width))
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
@@ -219,7 +225,10 @@ def _list_numbers(summary: Summary) -> list[tuple[str, str]]:
 
 
 def _label_ticks(range_px: tuple[float, float], camera: StereoCamera | None) -> list[str]:
-    """Return five labels of the colour bar, evenly spaced in disparity: metres with a camera, else pixels."""
+    """Return five labels for the colour bar, evenly spaced in disparity.
+
+    They are in metres if the camera is known, else in pixels.
+    """
     values_px = np.linspace(*range_px, 5)
     if camera is None:
         return [f"{value_px:.1f} px" for value_px in values_px]
@@ -227,7 +236,7 @@ def _label_ticks(range_px: tuple[float, float], camera: StereoCamera | None) -> 
 
 
 def _depth_m(camera: StereoCamera | None, disparity_px: float) -> float | None:
-    """Depth of one disparity; None if infinite or without a camera."""
+    """Return the depth of a disparity in metres; None if it is infinite or the camera is unknown."""
     if camera is None:
         return None
     depth_m = float(camera.depth_m(np.array([[disparity_px]], np.float64))[0, 0])

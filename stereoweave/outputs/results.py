@@ -82,11 +82,11 @@ class DepthJob:
 
     Attributes:
         request: How the pictures are opened and rectified.
-        backend: The matcher.
-        options: Settings of the matching.
-        files: Output files besides `always`, names in FILES or "all"; depth.png is added if there is a
-            camera.
-        always: Output files of every pair.
+        backend: The matcher and the hardware that runs it.
+        options: Matching settings.
+        files: Output files besides `always`: names in FILES, or "all". depth.png is added if the camera is
+            known.
+        always: Output files written for every pair.
         name_of: The front end's names of settings, for the notes and failures that a batch records.
     """
 
@@ -117,9 +117,10 @@ def make_depth(pictures: Sequence[Path], out: Path, job: DepthJob) -> tuple[Summ
 
 
 def job_facts(job: DepthJob) -> dict[str, Any]:
-    """Return everything that determines a pair's results besides its pictures; files are named by their hash.
+    """Return everything but the pictures that determines a pair's results; files are given by their hashes.
 
-    The provider and the threads are not included: a batch whose GPU fails can be finished on the CPU.
+    The provider and the number of threads are left out, so that a batch whose GPU fails can be finished on
+    the CPU.
     """
     model, calibration = str(job.backend.model), job.request.calibration
     if model.endswith(".onnx"):
@@ -127,7 +128,7 @@ def job_facts(job: DepthJob) -> dict[str, Any]:
             model = _hash_content(model, Path(model).read_bytes())
     facts = {"stereoweave": __version__, "model": model, **asdict(job.options)}
     request = asdict(job.request)
-    # "arrangement" is the name in the files of begun batches.
+    # In the stored descriptions of earlier batches, the format is called "arrangement".
     facts |= {"files": job.files, "always": job.always, "arrangement": request.pop("format"), **request}
     if calibration:
         facts["calibration"] = _hash_content(calibration, read_calibration_bytes(calibration))
@@ -139,12 +140,16 @@ def _hash_content(path: str | Path, content: bytes) -> str:
 
 
 def needs_camera(file: str) -> bool:
-    """Whether an output file is in metres."""
+    """Return whether an output file is in metres, which requires a camera."""
     return file.startswith(("depth.", "cloud.", "mesh."))
 
 
 def _choose_files(job: DepthJob, pair: StereoPair) -> tuple[list[str], list[Note]]:
-    """Return a pair's output files, and notes; raise a StereoweaveError if one needs a missing camera."""
+    """Return a pair's output files, and notes on files left out.
+
+    Raises:
+        StereoweaveError: A file needs a camera, but the pair has none; or trimesh is missing.
+    """
     wanted, notes = {*job.always, *job.files}, list[Note]()
     if pair.camera:
         wanted.add("depth.png")
@@ -167,8 +172,8 @@ def _write_together(out: Path) -> Iterator[Path]:
     """Yield a temporary folder whose files move to `out` at the end; an error leaves `out` unchanged.
 
     Files of an earlier result that the new one lacks are removed, so that all of `out` belongs to one result.
-    An earlier result is recognised by disparity.pfm, which every result has and which is moved first; without
-    it, files of these names are the user's and stay.
+    An earlier result is recognised by disparity.pfm, which every result has and which is moved first. In a
+    folder without it, files with the names of output files are the user's and stay.
     """
     standing = make_parent_folder(*(out / file for file in FILES))
     with tempfile.TemporaryDirectory(prefix=".stereoweave-", dir=standing) as name:
@@ -185,7 +190,7 @@ def _write_together(out: Path) -> Iterator[Path]:
 
 
 def write_files(folder: Path, files: Sequence[str], result: Result) -> list[Note]:
-    """Write the files. Returns a note with the reason for each one that is skipped or thinned."""
+    """Write output files of a result. Returns a note for each file that is skipped or thinned."""
     notes = []
     for file in files:
         try:

@@ -22,13 +22,13 @@ from stereoweave.stereo import Estimate, StereoPair
 
 @dataclass(frozen=True, kw_only=True)
 class Result:
-    """A matched pair and its numbers.
+    """A matched pair with its estimate and summary.
 
     Attributes:
         pair: The pair, with its camera if known.
         estimate: The pair's estimate.
         summary: Summary of the pair and its estimate.
-        notes: What was detected or changed while the pictures were read.
+        notes: Notes on what was detected or changed while the pictures were read.
         threads: Number of threads for rendering; default: all cores.
     """
 
@@ -45,16 +45,16 @@ class Result:
         return np.ones(self.estimate.disparity_px.shape, bool) if seen is None else seen
 
     def disparity_px(self, unknown: float = np.nan) -> Float32[np.ndarray, "h w"]:
-        """The left view's disparity, with `unknown` where there is none."""
+        """Return the left image's disparity in px, with `unknown` outside the image's content."""
         return np.where(self.seen, self.estimate.disparity_px, np.float32(unknown)).astype(np.float32)
 
     def depth_m(self, unknown: float = np.nan) -> Float[np.ndarray, "h w"]:
-        """The left view's depth in metres, with `unknown` where there is none."""
+        """Return the left image's depth in metres, with `unknown` outside the image's content."""
         depth_m = require_camera(self.pair).depth_m(self.estimate.disparity_px)
         return np.where(self.seen, depth_m, np.float32(unknown))
 
     def warnings(self) -> list[Note]:
-        """Notes on likely defects of the pair; takes about half as long as matching."""
+        """Return notes on likely defects of the pair; this takes about half as long as matching."""
         return find_problems(self.pair, self.estimate)
 
     @cached_property
@@ -67,13 +67,13 @@ class Result:
 
 
 def run(prepared: Prepared, matcher: Matcher, options: MatchOptions) -> Result:
-    """Match and summarise a prepared pair; raises what `match` raises."""
+    """Match and summarise a prepared pair. Raises the errors of `match`."""
     (result,) = run_many([prepared], matcher, options)
     return result
 
 
 def run_many(prepared: Sequence[Prepared], matcher: Matcher, options: MatchOptions) -> list[Result]:
-    """Match prepared pairs together and summarise each; the time is divided equally."""
+    """Match prepared pairs together and summarise each one with an equal share of the matching time."""
     start_s = time.perf_counter()
     estimates = match_many(matcher, [each.pair for each in prepared], options)
     total_ms = 1000 * (time.perf_counter() - start_s)

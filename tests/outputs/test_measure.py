@@ -32,8 +32,9 @@ def flat(disparity_px=5.0) -> np.ndarray:
     return np.full((40, 60), disparity_px)
 
 
-def test_a_confidence_of_nine_in_ten_stands_for_half_a_pixel():
-    # 1 of 10 errors is 1 px or more; so 1 of 100 is 2 px or more, and 0.3173 are ln(0.3173) / ln(0.1) px.
+def test_a_confidence_of_nine_in_ten_means_an_error_of_half_a_pixel():
+    # 1 in 10 errors is at least 1 px, so 1 in 100 is at least 2 px, and 31.73 % are at least
+    # ln(0.3173) / ln(0.1) px.
     assert disparity_error_px(0.9) == pytest.approx(0.49853, abs=1e-5)
     assert math.pow(0.1, 0.49853) == pytest.approx(0.3173, abs=1e-5)
     assert disparity_error_px(0.99) == pytest.approx(0.49853 / 2, abs=1e-5)
@@ -42,30 +43,30 @@ def test_a_confidence_of_nine_in_ten_stands_for_half_a_pixel():
 
 def test_a_distance_across_the_picture():
     found = distance(estimate_of(flat()), CAMERA, (20, 20), (40, 20))
-    # At 10 m * px / 5 px = 2 m a pixel is 0.02 m wide.
+    # At 10 m * px / 5 px = 2 m, a pixel is 0.02 m wide.
     assert found.distance_m == pytest.approx(0.4)
     assert found.first_m == pytest.approx((-0.2, 0, 2))
     assert found.second_m == pytest.approx((0.2, 0, 2))
-    # Either end moves by 0.2 m / 5 px along the line, each by 0.49853 px.
+    # Each end moves along the line by 0.2 m / 5 px, for an error of 0.49853 px.
     assert found.uncertainty_m == pytest.approx(math.sqrt(2) * 0.04 * 0.49853, abs=1e-6)
 
 
-def test_a_distance_into_the_picture_is_as_uncertain_as_its_far_end():
+def test_a_distance_along_the_axis_is_as_uncertain_as_its_far_end():
     disparity_px = flat()
     disparity_px[:, 30:] = 20
     found = distance(estimate_of(disparity_px), CAMERA, (29, 20), (30, 20))
     assert found.distance_m == pytest.approx(1.5, abs=1e-3)
-    # Z^2 / (f B) * sigma_d: 4 / 10 and 0.25 / 10 m a px
+    # Z^2 / (f B) * sigma_d: 4 / 10 and 0.25 / 10 m per px
     assert found.uncertainty_m == pytest.approx(math.hypot(0.4, 0.025) * 0.49853, rel=1e-3)
 
 
-def test_doffs_belongs_to_the_depth():
+def test_depth_takes_doffs_into_account():
     camera = StereoCamera(focal_px=100.0, baseline_m=0.1, cx_px=30.0, cy_px=20.0, doffs_px=3.0)
     moved = distance(estimate_of(flat(2.0)), camera, (20, 20), (40, 20))
     assert moved == distance(estimate_of(flat()), CAMERA, (20, 20), (40, 20))
 
 
-def test_the_cameras_own_uncertainty_adds_up_in_squares():
+def test_the_camera_s_own_uncertainty_is_added_in_quadrature():
     disparity_px = flat()
     disparity_px[:, 30:] = 20
     sure = estimate_of(disparity_px)
@@ -73,12 +74,12 @@ def test_the_cameras_own_uncertainty_adds_up_in_squares():
     for pixels, focal_share in ((across, 0.0), (into, 1.0)):
         exact = distance(sure, CAMERA, *pixels)
         found = distance(sure, CAMERA, *pixels, camera_error=CameraError(focal=0.3, baseline=0.4))
-        # The whole of the baseline's, and of the focal length's what goes into the picture.
+        # The full baseline error, and the part of the focal length error that is due to the depth difference.
         parts = exact.uncertainty_m, 0.4 * exact.distance_m, 0.3 * focal_share * exact.distance_m
         assert found.uncertainty_m == pytest.approx(math.hypot(*parts), rel=1e-3)
 
 
-def test_a_focal_length_is_as_wrong_as_the_distance_that_it_gives():
+def test_a_focal_length_error_changes_the_distance_as_predicted():
     disparity_px = flat()
     disparity_px[:, 30:] = 8
     pixels = (10, 5), (50, 33)
@@ -90,13 +91,13 @@ def test_a_focal_length_is_as_wrong_as_the_distance_that_it_gives():
 
 
 @pytest.mark.parametrize(("pixel", "least", "most"), [((30, 20), 0.66, 0.71), ((10, 5), 0.61, 0.72)])
-def test_of_laplaces_errors_68_percent_are_below_the_uncertainty(rng, pixel, least, most):
-    # One pixel far, whose error is nearly all there is; or two alike, of which the sum is.
+def test_68_percent_of_laplace_distributed_errors_are_below_the_uncertainty(rng, pixel, least, most):
+    # One point is far, and its error dominates; or both points are alike, and their errors add up.
     truth_px = flat(50.0)
     truth_px[pixel[1] - 3 : pixel[1] + 4, pixel[0] - 3 : pixel[0] + 4] = 20 if pixel == (30, 20) else 50
     other = (50, 35)
     true_m = distance(estimate_of(truth_px), CAMERA, pixel, other).distance_m
-    width_px = 1 / math.log(10)  # so that an error below 1 px has a probability of 0.9
+    width_px = 1 / math.log(10)  # an error below 1 px then has a probability of 0.9
     held = []
     for first_px, second_px in rng.laplace(0, width_px, (1500, 2)):
         noisy_px = truth_px + second_px
@@ -106,7 +107,7 @@ def test_of_laplaces_errors_68_percent_are_below_the_uncertainty(rng, pixel, lea
     assert least < np.mean(held) < most
 
 
-def test_what_the_network_measures_is_as_certain_as_it_says(rng):
+def test_the_network_s_measurements_are_as_certain_as_stated(rng):
     matcher, ratios = Matcher("small"), []
     height, width = 256, 384
     camera = StereoCamera(focal_px=550.0, baseline_m=0.1, cx_px=191.5, cy_px=127.5)
@@ -125,9 +126,9 @@ def test_what_the_network_measures_is_as_certain_as_it_says(rng):
 
 def test_a_disparity_is_the_median_of_its_surface():
     disparity_px = flat()
-    disparity_px[20, 20] = 5.9  # one pixel's noise
+    disparity_px[20, 20] = 5.9  # noise in one pixel
     disparity_px[:, 42:] = 50  # another surface, next to the second pixel
-    disparity_px[19, 41] = 9  # not of this one either
+    disparity_px[19, 41] = 9  # not on this surface either
     found = distance(estimate_of(disparity_px), CAMERA, (20, 20), (41, 20))
     assert found.first_m[2] == found.second_m[2] == pytest.approx(2)
 
@@ -143,7 +144,7 @@ def test_a_disparity_is_the_median_of_its_surface():
         ((20, 20), (7, 30), "pixel 7,30: .* at infinity"),
     ],
 )
-def test_a_pixel_without_depth_is_told_in_one_line(first_px, second_px, message):
+def test_a_pixel_without_depth_is_a_one_line_error(first_px, second_px, message):
     disparity_px, confidence = flat(), np.full((40, 60), 0.9, np.float32)
     disparity_px[25:] = 0
     confidence[6, 6] = 0.49
@@ -169,7 +170,7 @@ def test_an_uncertainty_is_not_negative(shares):
         (2.0, 0.0, "2.000000 m ± 0.000000 m (68 %)"),
     ],
 )
-def test_a_measurement_is_told_as_exactly_as_it_is(distance_m, uncertainty_m, words):
+def test_a_measurement_is_formatted_with_its_significant_digits(distance_m, uncertainty_m, words):
     there = (0.0, 0.0, 1.0)
     found = Measurement(distance_m=distance_m, uncertainty_m=uncertainty_m, first_m=there, second_m=there)
     assert str(found) == words
@@ -205,7 +206,7 @@ def test_the_command_measures_between_two_pixels(capfd):
         ("320,240", {"range_px": "nan,3"}, "--range: .* found 'nan,3'"),
     ],
 )
-def test_a_mistake_with_measuring_is_told_before_anything_is_matched(first, options, message):
+def test_wrong_measuring_options_are_reported_before_matching(first, options, message):
     pictures = [TEXTURED / "left.png", TEXTURED / "right.png"]
     with pytest.raises(StereoweaveError, match=message):
         measure(pictures, first, "420,300", model="none.onnx", **options)

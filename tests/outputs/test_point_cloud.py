@@ -19,7 +19,7 @@ from stereoweave.outputs.point_cloud import (
 )
 from stereoweave.stereo import Estimate, StereoCamera, StereoPair
 
-# 100 px * 0.1 m: a disparity of 5 px is at 2 m, one of 20 px at 0.5 m.
+# 100 px * 0.1 m: a disparity of 5 px is 2 m away, 20 px is 0.5 m away.
 CAMERA = StereoCamera(focal_px=100.0, baseline_m=0.1, cx_px=30.0, cy_px=20.0)
 FAR_PX, NEAR_PX = 5.0, 20.0
 
@@ -40,7 +40,7 @@ def pair_of(size, *, camera=CAMERA, left_seen=None) -> StereoPair:
 
 
 def two_planes(height=40, width=60) -> np.ndarray:
-    """A square in front of a wall."""
+    """Return the disparity of a square in front of a wall."""
     disparity_px = np.full((height, width), FAR_PX, np.float32)
     disparity_px[10:30, 20:40] = NEAR_PX
     return disparity_px
@@ -72,7 +72,7 @@ def test_no_point_flies_between_two_planes(blur_px, turned_degrees):
         make_point_cloud(pair, estimate).points_m[:, 2],
         make_mesh(pair, estimate).points_m[:, 2],
     ):
-        # On a plane to 1.5 px: 10 / 18.5, 10 / 6.5 m
+        # Within 1.5 px of a plane: 10 / 18.5 m, 10 / 6.5 m
         assert ((depth_m < 0.541) | (depth_m > 1.538)).all()
         assert depth_m.min() < 0.51 and depth_m.max() > 1.99
 
@@ -82,19 +82,19 @@ def test_a_sharp_edge_loses_no_point():
 
 
 def test_a_thin_rod_and_a_slanted_surface_keep_all_their_points():
-    slanted_px = np.broadcast_to(np.linspace(2, 26, 61)[:60], (40, 60)).copy()  # 0.4 px a px
+    slanted_px = np.broadcast_to(np.linspace(2, 26, 61)[:60], (40, 60)).copy()  # 0.4 px per px
     slanted_px[:, 30] = 60
     assert find_reliable(pair_of((40, 60)), estimate_of(slanted_px)).all()
 
 
-def test_what_is_not_known_gives_no_point():
+def test_pixels_without_reliable_depth_give_no_points():
     disparity_px, confidence = np.full((40, 60), FAR_PX), np.full((40, 60), 0.5, np.float32)
     occluded, left_seen = np.zeros((40, 60), bool), np.ones((40, 60), bool)
     confidence[0, 0] = 0.49
     occluded[0, 1] = True
     left_seen[0, 2] = False
     disparity_px[0, 3:] = 0.0  # infinitely far
-    disparity_px[1] = 0.5  # next to it
+    disparity_px[1] = 0.5  # nearly infinitely far
     pair = pair_of((40, 60), left_seen=left_seen)
     estimate = estimate_of(disparity_px, confidence=confidence, occluded=occluded)
     expected = np.ones((40, 60), bool)
@@ -104,7 +104,7 @@ def test_what_is_not_known_gives_no_point():
     assert not find_reliable(pair, estimate, least_confidence=0.6).any()
 
 
-def test_a_wall_is_a_surface_of_two_triangles_a_square_that_face_the_camera():
+def test_the_mesh_of_a_wall_has_two_triangles_per_square_facing_the_camera():
     wall = make_mesh(pair_of((40, 60)), estimate_of(np.full((40, 60), FAR_PX)))
     assert (len(wall.points_m), len(wall.faces)) == (40 * 60, 2 * 39 * 59)
     corners_m = wall.points_m[wall.faces]
@@ -117,13 +117,13 @@ def test_no_triangle_crosses_a_jump_of_depth():
     found = make_mesh(pair_of((40, 60)), estimate_of(two_planes()))
     depths_m = found.points_m[found.faces][..., 2]
     assert np.ptp(depths_m, axis=1).max() == 0
-    # The square of 20x20 pixels; and the wall without the 21x21 squares that touch it.
+    # The square of 20x20 pixels, and the wall without the 21x21 grid squares that touch it.
     assert (depths_m[:, 0] == 0.5).sum() == 2 * 19 * 19
-    # At two corners of the square one triangle of three wall pixels is left.
+    # At two corners of the square, one triangle of three wall pixels remains.
     assert (depths_m[:, 0] == 2).sum() == 2 * (39 * 59 - 21 * 21) + 2
 
 
-def test_a_point_without_a_neighbour_is_no_part_of_a_surface():
+def test_a_point_without_a_neighbour_is_not_part_of_a_mesh():
     confidence = np.zeros((40, 60), np.float32)
     confidence[5, 5] = confidence[20:22, 20:22] = 1
     found = make_mesh(pair_of((40, 60)), estimate_of(np.full((40, 60), FAR_PX), confidence=confidence))
@@ -131,10 +131,10 @@ def test_a_point_without_a_neighbour_is_no_part_of_a_surface():
     assert set(found.faces.ravel()) == {0, 1, 2, 3}
 
 
-def test_of_a_large_picture_every_so_manieth_pixel_counts():
+def test_a_large_picture_is_thinned_to_every_nth_pixel():
     pair, estimate = pair_of((40, 60)), estimate_of(two_planes())
     cloud = make_point_cloud(pair, estimate, most_points=300)
-    # Every second of rows and columns would be 20 * 30 = 600, every third is 14 * 20 = 280.
+    # Every second row and column would give 20 * 30 = 600 points, every third gives 14 * 20 = 280.
     assert (cloud.step_px, len(cloud.points_m)) == (3, 280)
     whole = make_point_cloud(pair, estimate)
     picked = np.arange(2400).reshape(40, 60)[::3, ::3].ravel()
@@ -144,19 +144,19 @@ def test_of_a_large_picture_every_so_manieth_pixel_counts():
     assert (wall.step_px, len(wall.faces)) == (3, 2 * 13 * 19)
 
 
-def test_a_ply_file_holds_points_in_metres_upright_for_viewers_and_the_photographs_colours(tmp_path):
+def test_a_ply_file_holds_points_in_metres_in_the_axes_of_viewers_with_colours(tmp_path):
     cloud = make_point_cloud(pair_of((40, 60)), estimate_of(two_planes()))
     write_ply(tmp_path / "cloud.ply", cloud)
     found = trimesh.load(tmp_path / "cloud.ply")
     x, y, z = cloud.points_m.T
     np.testing.assert_array_equal(found.vertices, np.stack([x, -y, -z], axis=1))
     np.testing.assert_array_equal(found.colors[:, :3], cloud.colours)
-    # The first pixel is left of the middle and above it: 30 / 100 * 2, 20 / 100 * 2, and 2 m ahead.
+    # The first pixel is left of the centre and above it: 30 / 100 * 2, 20 / 100 * 2, and 2 m ahead.
     np.testing.assert_allclose(found.vertices[0], [-0.6, 0.4, -2], rtol=1e-6)
     assert list(tmp_path.iterdir()) == [tmp_path / "cloud.ply"]
 
 
-def test_a_ply_file_holds_a_surface(tmp_path):
+def test_a_ply_file_holds_a_mesh(tmp_path):
     made = make_mesh(pair_of((40, 60)), estimate_of(two_planes()))
     write_ply(tmp_path / "mesh.ply", made)
     found = trimesh.load(tmp_path / "mesh.ply", process=False)
@@ -170,7 +170,7 @@ GREYS = {0: 0.0, 10: 10 / 255 / 12.92, 11: 11 / 255 / 12.92, 188: 0.50289, 255: 
 
 
 @pytest.mark.parametrize("kind", [PointCloud, Mesh])
-def test_a_glb_file_holds_the_same_with_its_own_light(tmp_path, kind):
+def test_a_glb_file_holds_the_same_with_unlit_colours(tmp_path, kind):
     colours = np.repeat(np.array(list(GREYS), np.uint8)[:, None], 3, axis=1)
     points_m = np.array([[0, 0, 1], [1, 0, 1], [0, 1, 1], [1, 1, 1], [2, 3, 4]], np.float32)
     faces = {"faces": np.array([[0, 2, 1], [1, 2, 3], [3, 2, 4]], np.int32)} if kind is Mesh else {}
@@ -187,14 +187,14 @@ def test_a_glb_file_holds_the_same_with_its_own_light(tmp_path, kind):
         light, np.repeat(np.array(list(GREYS.values()))[:, None], 3, axis=1), atol=1e-5
     )
     assert primitive["mode"] == (4 if kind is Mesh else 0)
-    # The photograph has its light in it: no lamp of the viewer's may add to it.
+    # The image already contains the scene's lighting, so the viewer must not add any.
     assert tree["extensionsUsed"] == ["KHR_materials_unlit"]
     assert "KHR_materials_unlit" in tree["materials"][primitive["material"]]["extensions"]
     assert all("matrix" not in node for node in tree["nodes"])
 
 
 def chunks(path) -> tuple[dict, bytes]:
-    """The two parts of a GLB file: what is in it, and the numbers."""
+    """Return the two chunks of a GLB file: its JSON description and the binary data."""
     content = path.read_bytes()
     assert (content[:4], int.from_bytes(content[8:12], "little")) == (b"glTF", len(content))
     length = int.from_bytes(content[12:16], "little")
@@ -202,21 +202,21 @@ def chunks(path) -> tuple[dict, bytes]:
 
 
 def values(tree: dict, data: bytes, accessor_at: int) -> np.ndarray:
-    """The float32 [N, 3] of an accessor."""
+    """Return the values of an accessor, float32 [N, 3]."""
     accessor = tree["accessors"][accessor_at]
     assert (accessor["componentType"], accessor["type"]) == (5126, "VEC3")
     view = tree["bufferViews"][accessor["bufferView"]]
     return np.frombuffer(data, "<f4", 3 * accessor["count"], view["byteOffset"]).reshape(-1, 3)
 
 
-def test_metres_need_a_camera(tmp_path):
+def test_a_point_cloud_needs_a_camera(tmp_path):
     pair = pair_of((40, 60), camera=None)
     for make in (make_point_cloud, make_mesh):
         with pytest.raises(StereoweaveError, match=r"calibration.*\(calibration, focal_px, baseline_m\)"):
             make(pair, estimate_of(two_planes()))
 
 
-def test_nothing_known_is_an_error():
+def test_a_pair_without_known_depth_is_an_error():
     nothing = estimate_of(two_planes(), confidence=np.zeros((40, 60), np.float32))
     with pytest.raises(EmptyError, match="known depth, found none"):
         make_point_cloud(pair_of((40, 60)), nothing)

@@ -19,13 +19,13 @@ SHIFT_PX = 32
 
 
 def texture(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
-    """Soft coloured blobs, so that neither JPEG nor scaling changes them much."""
+    """Return an image of soft coloured blobs, which neither JPEG nor scaling changes much."""
     coarse = rng.integers(0, 256, (height // 16 + 2, width // 16 + 2, 3), dtype=np.uint8)
     return np.asarray(Image.fromarray(coarse).resize((width, height), Image.Resampling.BICUBIC))
 
 
 def wall(photograph: np.ndarray, shift_px: int, camera: StereoCamera | None) -> tuple[StereoPair, Estimate]:
-    """A wall of one disparity in front of both cameras: the right one sees it `shift_px` further left."""
+    """Return a pair that shows a wall of constant disparity `shift_px`, and its estimate."""
     pair = StereoPair(left=photograph[:, :-shift_px], right=photograph[:, shift_px:], camera=camera)
     disparity_px = np.full(pair.left.shape[:2], shift_px, np.float32)
     return pair, Estimate(
@@ -41,7 +41,7 @@ def summary_of(pair: StereoPair, estimate: Estimate, *pictures: str) -> Summary:
 
 
 def pictures_in(page: str) -> dict[str, np.ndarray]:
-    """The pictures of the page by their alternative text."""
+    """Return the images of the page by their alternative text."""
     tags = re.findall(r'src="data:image/jpeg;base64,([^"]+)" alt="([^"]+)"', page)
     return {alt: np.asarray(Image.open(io.BytesIO(base64.b64decode(jpeg)))) for jpeg, alt in tags}
 
@@ -50,7 +50,7 @@ def difference(one: np.ndarray, other: np.ndarray) -> float:
     return float(np.abs(one.astype(float) - other).mean())
 
 
-def test_the_summary_has_the_numbers_of_the_estimate():
+def test_the_summary_matches_the_estimate():
     disparity_px = np.array([[1, 2, 4, 8, 16]] * 32, np.float32)
     estimate = Estimate(
         disparity_px=disparity_px,
@@ -77,7 +77,7 @@ def test_a_depth_is_none_without_a_camera_and_at_infinity(rng):
     assert summary_of(*wall(photograph, SHIFT_PX, toed_in), "a.png").depth_max_m is None
 
 
-def test_each_view_of_the_page_is_the_wall_seen_from_there(rng, tmp_path):
+def test_each_view_of_the_report_is_the_wall_seen_from_its_position(rng, tmp_path):
     photograph = texture(rng, 120, 320 + SHIFT_PX)
     pair, estimate = wall(photograph, SHIFT_PX, CAMERA)
     write_report(tmp_path / "report.html", pair, estimate, summary_of(pair, estimate, "a.png"))
@@ -88,7 +88,7 @@ def test_each_view_of_the_page_is_the_wall_seen_from_there(rng, tmp_path):
         assert difference(pictures[f"View at position {position}"], expected) < 3
 
 
-def test_a_long_picture_is_shrunk_and_its_disparity_with_it(rng, tmp_path):
+def test_a_large_picture_is_downscaled_with_its_disparity(rng, tmp_path):
     photograph = texture(rng, 160, 2000 + 80)
     pair, estimate = wall(photograph, 80, None)
     write_report(tmp_path / "report.html", pair, estimate, summary_of(pair, estimate, "a.png"))
@@ -98,7 +98,7 @@ def test_a_long_picture_is_shrunk_and_its_disparity_with_it(rng, tmp_path):
     assert difference(pictures["View at position 0.5"], halfway) < 5
 
 
-def test_what_the_left_picture_does_not_show_has_no_colour_of_depth(rng, tmp_path):
+def test_depth_is_black_outside_the_left_image_s_content(rng, tmp_path):
     pair, estimate = wall(texture(rng, 120, 320 + SHIFT_PX), SHIFT_PX, CAMERA)
     seen = np.ones((120, 320), bool)
     seen[:, :80] = False
@@ -153,7 +153,7 @@ def photograph(rng) -> np.ndarray:
 
 @pytest.fixture
 def report(photograph, tmp_path) -> Path:
-    """A report about a wall 0.5 m away."""
+    """Write a report on a wall 0.5 m away. Returns its path."""
     pair, estimate = wall(photograph, SHIFT_PX, CAMERA)
     write_report(tmp_path / "report.html", pair, estimate, summary_of(pair, estimate, "a.png", "b.png"))
     return tmp_path / "report.html"
@@ -161,7 +161,7 @@ def report(photograph, tmp_path) -> Path:
 
 @pytest.fixture
 def page(browser) -> Iterator[Page]:
-    """An empty page of the browser, whose scripts may not fail."""
+    """Yield an empty browser page; the test fails if one of its scripts does."""
     page = browser.new_page(viewport={"width": 1200, "height": 1600})
     errors: list[str] = []
     page.on("pageerror", lambda error: errors.append(str(error)))
@@ -173,7 +173,7 @@ def page(browser) -> Iterator[Page]:
 @pytest.mark.needs_chromium
 def test_the_slider_changes_the_picture(page, report, photograph):
     def seen_from(position: float) -> float:
-        """How far what the browser shows is from the wall as the camera at `position` sees it."""
+        """Return the difference between the displayed image and the wall seen from `position`."""
         shown = np.asarray(Image.open(io.BytesIO(page.locator("#stage").screenshot())).convert("RGB"))
         moved_px = round(position * SHIFT_PX)
         expected = Image.fromarray(photograph[:, moved_px : moved_px + 320]).resize(shown.shape[1::-1])
@@ -206,7 +206,7 @@ def test_pointing_at_the_depth_reads_it(page, report):
 
 
 @pytest.mark.needs_chromium
-def test_opening_the_page_asks_for_that_file_alone(page, report):
+def test_opening_the_report_requests_only_its_own_file(page, report):
     requested: list[str] = []
     page.on("request", lambda request: requested.append(request.url))
     page.goto(report.as_uri())

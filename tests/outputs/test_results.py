@@ -36,7 +36,7 @@ def matcher() -> Matcher:
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch) -> Path:
-    """The folder that the test runs in: a piece of the example, 96x64, and its calibration."""
+    """Run the test in a folder with a 96x64 px crop of the example and its calibration."""
     monkeypatch.chdir(tmp_path)
     for name in ("left.png", "right.png"):
         write_image(name, np.ascontiguousarray(read_image(TEXTURED / name)[200:264, 300:396]))
@@ -48,14 +48,14 @@ def names_in(folder: str) -> set[str]:
     return {file.name for file in Path(folder).iterdir()}
 
 
-def test_what_is_written_unless_more_is_asked_for(folder):
+def test_the_files_that_are_written_by_default(folder):
     make_depth(PICTURES, Path("plain"), PLAIN)
     assert names_in("plain") == set(ALWAYS)
     make_depth(PICTURES, Path("metric"), WITH_CAMERA)
     assert names_in("metric") == {*ALWAYS, "depth.png"}
 
 
-def test_all_files_say_the_same(folder):
+def test_all_files_agree(folder):
     _, notes = make_depth(PICTURES, Path("out"), replace(WITH_CAMERA, files=("all",)))
     assert names_in("out") == set(FILES)
     assert notes == []
@@ -82,7 +82,7 @@ def test_all_files_say_the_same(folder):
     np.testing.assert_array_equal(glb_mesh.faces, mesh.faces)
 
 
-def test_the_mask_is_white_where_the_left_camera_alone_sees(folder, matcher):
+def test_the_occlusion_mask_is_white_where_only_the_left_camera_sees(folder, matcher):
     make_depth(PICTURES, Path("out"), PLAIN)
     estimate = matcher.estimate(read_image("left.png"), read_image("right.png"))
     mask = read_pixels("out/occluded.png", "L")
@@ -90,14 +90,14 @@ def test_the_mask_is_white_where_the_left_camera_alone_sees(folder, matcher):
     np.testing.assert_array_equal(mask == 0, ~estimate.occluded)
 
 
-def test_files_of_an_earlier_result_go(folder):
+def test_files_of_an_earlier_result_are_removed(folder):
     make_depth(PICTURES, Path("out"), replace(WITH_CAMERA, files=("all",)))
     Path("out/mine.txt").write_text("kept")
     make_depth(PICTURES, Path("out"), PLAIN)
     assert names_in("out") == {*ALWAYS, "mine.txt"}
 
 
-def test_files_of_the_same_names_that_are_no_earlier_result_stay(folder):
+def test_files_with_the_same_names_that_are_not_an_earlier_result_stay(folder):
     for name in ("mesh.ply", "depth.npy"):
         Path(name).write_text("of another program")
     make_depth(PICTURES, Path(), PLAIN)
@@ -112,7 +112,7 @@ def test_results_do_not_move_into_a_folder_that_another_command_writes_to(folder
     assert {file: file.read_bytes() for file in Path("out").iterdir()} == before
 
 
-def test_an_unknown_file_is_told_with_those_that_there_are():
+def test_an_unknown_file_is_refused_with_a_list_of_the_known_ones():
     with pytest.raises(StereoweaveError, match=r"^files: .*disparity.npy.*mesh.glb.*found 'cloud.obj'$"):
         DepthJob(files=("depth.npy", "cloud.obj"))
 
@@ -124,20 +124,20 @@ def test_metres_without_a_camera_are_refused_before_anything_is_written(folder, 
     assert not Path("out").exists()
 
 
-def test_all_without_a_camera_is_all_but_metres_and_says_so(folder):
+def test_all_without_a_camera_leaves_out_files_in_metres_with_a_note(folder):
     _, notes = make_depth(PICTURES, Path("out"), DepthJob(files=("all",)))
     assert names_in("out") == {*ALWAYS, "disparity.npy", "disparity.tiff"}
     assert [note for note in notes if "(calibration, focal_px, baseline_m)" in str(note)] != []
 
 
-def test_points_without_trimesh_name_the_extra_before_anything_is_written(folder, monkeypatch):
+def test_a_point_cloud_without_trimesh_names_the_extra_before_anything_is_written(folder, monkeypatch):
     monkeypatch.setitem(sys.modules, "trimesh", None)
     with pytest.raises(StereoweaveError, match=r"stereoweave\[mesh\]"):
         make_depth(PICTURES, Path("out"), replace(WITH_CAMERA, files=("cloud.ply",)))
     assert not Path("out").exists()
 
 
-def test_a_pair_without_a_point_gets_the_rest_and_a_line(folder):
+def test_a_pair_without_points_gets_the_other_files_and_a_note(folder):
     for name in PICTURES:
         Image.new("RGB", (96, 64)).save(name)
     job = replace(WITH_CAMERA, files=("cloud.ply", "mesh.glb"))
@@ -150,7 +150,7 @@ def test_a_pair_without_a_point_gets_the_rest_and_a_line(folder):
 
 
 def result_half_seen() -> Result:
-    """Disparities of 4 px, 0 in the right third; the left half of the left picture shows nothing."""
+    """Return a result of 4 px, and 0 px in the right third; the left image's left half has no content."""
     disparity_px = np.full((64, 96), 4, np.float32)
     disparity_px[:, 64:] = 0
     left_seen = np.ones((64, 96), bool)
@@ -167,7 +167,7 @@ def result_half_seen() -> Result:
     return Result(pair=pair, estimate=estimate, summary=summary)
 
 
-def test_what_the_left_picture_does_not_show_is_unknown_in_every_file(tmp_path):
+def test_pixels_outside_the_left_image_s_content_are_unknown_in_every_file(tmp_path):
     result = result_half_seen()
     for file, write in FILES.items():
         write(tmp_path / file, result)
@@ -192,14 +192,14 @@ def test_what_the_left_picture_does_not_show_is_unknown_in_every_file(tmp_path):
     assert (preview[:, :48] == 0).all() and (preview[:, 48:].max(axis=2) > 0).all()
 
 
-def test_the_summary_counts_what_the_left_picture_shows():
+def test_the_summary_counts_only_the_left_image_s_content():
     summary = result_half_seen().summary
-    # 4 px in 16 of the 48 columns, 0 in 32; outside of them nothing is confident.
+    # 4 px in 16 of the 48 columns, 0 px in 32; no pixel outside them is confident.
     assert (summary.disparity_median_px, summary.disparity_max_px) == (0, 4)
     assert (summary.confident_percent, summary.depth_min_m) == (100, 2)
 
 
-def test_what_is_asked_of_the_estimate_is_handed_on(folder, matcher):
+def test_matching_options_reach_the_matcher(folder, matcher):
     found_px = {}
     for name, job in {
         "plain": PLAIN,
@@ -215,7 +215,7 @@ def test_what_is_asked_of_the_estimate_is_handed_on(folder, matcher):
         np.testing.assert_array_equal(found_px[how], expected.disparity_px)
 
 
-def test_an_order_cannot_be_both_refined_and_raw():
+def test_a_job_cannot_be_both_refined_and_raw():
     with pytest.raises(StereoweaveError, match="raw: cannot be combined with refined"):
         MatchOptions(refined=True, raw=True)
 
@@ -226,19 +226,19 @@ def test_the_command_gives_the_networks_own_disparity_on_request(folder, matcher
     np.testing.assert_array_equal(read_pfm("out/disparity.pfm"), expected.disparity_px)
 
 
-def test_the_command_writes_what_it_is_told(folder, capfd):
+def test_the_command_writes_the_requested_files(folder, capfd):
     depth(Path("out"), PICTURES, calib=Path("calib.txt"), write=["cloud.ply", "depth.npy"])
     assert names_in("out") == {*ALWAYS, "depth.png", "cloud.ply", "depth.npy"}
     assert "report: out/report.html" in capfd.readouterr().out
 
 
-def test_a_camera_by_hand_looks_through_the_middle():
+def test_a_camera_from_numbers_has_a_centred_principal_point():
     image = np.zeros((480, 640, 3), np.uint8)
     expected = StereoCamera(focal_px=550.0, baseline_m=0.1, cx_px=319.5, cy_px=239.5)
     assert StereoCamera.centred(image, focal_px=550.0, baseline_m=0.1) == expected
 
 
-def test_what_a_batch_writes_down_of_its_job_keeps_its_names_so_that_earlier_batches_go_on():
+def test_a_batch_s_job_facts_keep_their_names_so_that_earlier_batches_can_resume():
     options = MatchOptions(range_px=(-20.0, 96.0), refined=True)
     facts = job_facts(DepthJob(options=options, backend=Backend(threads=2), files=("all",)))
     assert {name: value for name, value in facts.items() if name != "stereoweave"} == {

@@ -23,9 +23,7 @@ def prepared() -> Prepared:
     return prepare(PICTURES, Request(focal_px=995.0, baseline_m=0.193))
 
 
-def test_a_result_has_the_estimate_of_the_matcher_its_numbers_and_the_notes_of_its_pictures(
-    matcher, prepared
-):
+def test_a_result_has_the_matcher_s_estimate_a_summary_and_the_pictures_notes(matcher, prepared):
     result = run(prepared, matcher, MatchOptions(raw=True))
     own = matcher.estimate(prepared.pair.left, prepared.pair.right, raw=True)
     np.testing.assert_array_equal(result.estimate.disparity_px, own.disparity_px)
@@ -37,7 +35,7 @@ def test_a_result_has_the_estimate_of_the_matcher_its_numbers_and_the_notes_of_i
     assert result.threads == 1
 
 
-def test_results_of_pairs_matched_together_are_those_of_each_alone_and_share_the_time(matcher, prepared):
+def test_pairs_matched_together_have_the_results_of_each_alone_and_share_the_time(matcher, prepared):
     together = run_many([prepared, prepared], matcher, MatchOptions())
     alone = run(prepared, matcher, MatchOptions())
     for result in together:
@@ -46,7 +44,7 @@ def test_results_of_pairs_matched_together_are_those_of_each_alone_and_share_the
     assert together[0].summary.estimate_ms > 0
 
 
-def test_a_plain_pair_has_no_warnings_and_a_swapped_one_has(matcher, prepared):
+def test_a_good_pair_has_no_warnings_and_a_swapped_pair_has_one(matcher, prepared):
     assert run(prepared, matcher, MatchOptions()).warnings() == []
     swapped = prepare(PICTURES[::-1], Request())
     assert run(swapped, matcher, MatchOptions()).warnings() != []
