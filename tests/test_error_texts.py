@@ -1,4 +1,4 @@
-"""Error texts and notes in Python, where a setting is named by its keyword."""
+"""Error texts and notes of the Python interface name a setting by its keyword."""
 
 import ast
 import pickle
@@ -30,7 +30,7 @@ PACKAGE = Path(sw.__file__).parent
 PAIR = Path("left.png"), Path("right.png")
 PLAIN = Path("plain.png"), Path("plain.png")
 BLACK = np.zeros((64, 64, 3), np.uint8)
-# Options of other programs.
+# Options of other programs
 OTHERS = {
     "data/checksums.py": {"--check"},
     "data/paper_layout.py": {"--check"},
@@ -73,7 +73,7 @@ ERRORS = {
     "range_px: expected disparities between -64 and 64 px, the width of the pictures, got 70 and 80; omit it "
     "for automatic detection": lambda: sw.estimate(BLACK, BLACK, range_px=(70, 80)),
     "threads: expected a number from 1 to 1024, got 0": lambda: sw.Matcher(threads=0),
-    "position: expected -1.0 to 2.0 (0 left camera, 1 right), got 3": (
+    "position: expected -1.0 to 2.0 (0 is the left camera, 1 the right), got 3": (
         lambda: sw.synthesize(BLACK, BLACK, 3, threads=1)
     ),
     "expected one kind of output, found none; choose one (depth, depth16, position, layout)": VideoJob,
@@ -105,7 +105,7 @@ def test_a_note_names_settings_by_their_keyword(folder):
     ]
 
 
-def test_a_pair_of_unlike_exposures_advises_to_lock_them():
+def test_a_pair_with_different_exposures_is_advised_to_lock_them():
     brighter = Alignment(
         matches=500,
         vertical_error_px=0.1,
@@ -132,7 +132,7 @@ def test_a_pair_of_unlike_exposures_advises_to_lock_them():
         (Remedy("run it on cpu", ("provider",)), "two cameras"),
     ],
 )
-def test_a_remedy_that_a_front_end_does_not_have_is_left_out(remedy, text):
+def test_a_remedy_whose_settings_a_front_end_lacks_is_left_out(remedy, text):
     names = {"rectify": "R", "calibration": "C"}
     assert Note("two cameras", remedy).format(names.get) == text
     assert sw.StereoweaveError("two cameras", remedy=remedy).format(names.get) == text
@@ -166,7 +166,7 @@ def test_errors_cross_processes_with_setting_and_remedy(kind):
     assert vars(there) == vars(error)
 
 
-def test_a_detail_stands_before_the_remedy_and_keeps_the_class():
+def test_a_detail_is_inserted_before_the_remedy_and_keeps_the_class():
     error = errors.ProviderError("expected 1, found 2", remedy=Remedy("wait", ("threads",)))
     detailed = error.with_detail("parts are kept")
     assert type(detailed) is errors.ProviderError

@@ -18,29 +18,29 @@ from stereoweave.system.jit import compiled, inlined, kernel
 RIM_PX = 1
 """Within this distance of a depth edge, background pixels may carry the foreground's colour."""
 _PURE_PX = np.float32(1)
-"""A pixel with a neighbour nearer by more than this is not copied."""
+"""Pixels that have a neighbour nearer by more than this are not copied."""
 _ALIKE_PX = 2 * SAME_SURFACE_PX
 """Largest disparity difference between a surface and the pixels copied to it."""
 _LOOK_PX = 16
-"""Largest distance of a new candidate, not derived from a neighbour's source."""
+"""Largest distance of candidates that are not derived from a neighbour's source."""
 
 
 @kernel
 @typing.no_type_check
 def uncover(image, disparity_px, nearer_px, other_px, side, hidden_px, colours, first, end):
-    """Write the disparity and colour of the background where neither camera sees it, elsewhere NOTHING.
+    """Write the disparity and colour of the background that neither camera sees.
 
     Args:
         image: uint8 RGB [H, W, 3].
-        disparity_px: float32 [H, W], its disparity.
+        disparity_px: float32 [H, W], disparity of `image`.
         nearer_px: float32 [H, W], largest disparity in the 3x3 window minus the pixel's own.
         other_px: float32 [H, W], the other image's disparity.
         side: -1 for the left image, whose background is uncovered to the left of the foreground and whose
             column x corresponds to x - disparity in the other image; 1 for the right image.
-        hidden_px: float32 [H, W], output: disparity or NOTHING.
+        hidden_px: float32 [H, W], output: disparity of the hidden background, NOTHING elsewhere.
         colours: uint8 RGB [H, W, 3], output: written at hidden pixels only.
-        first: First row of the band; it does not use the row above.
-        end: Row after the last.
+        first: First row of the band; rows above it are not used.
+        end: Row after the last row of the band.
     """
     width = disparity_px.shape[1]
     origins = np.empty((2, width, 2), np.int32)  # source pixels of the colours in this row and the one above
@@ -60,7 +60,7 @@ def uncover(image, disparity_px, nearer_px, other_px, side, hidden_px, colours, 
 @compiled
 @typing.no_type_check
 def _find_hidden(disparity_px, other_px, side, hidden_px, borders):
-    """Write where a row's background continues behind the foreground, unseen by both cameras."""
+    """Write the disparity of a row's background where the foreground hides it from both cameras."""
     width = disparity_px.shape[0]
     hidden_px[:] = NOTHING
     for seen in range(width):
@@ -78,7 +78,7 @@ def _find_hidden(disparity_px, other_px, side, hidden_px, borders):
             there = round(at + side * behind_px)
             if 0 <= there < width and abs(other_px[there] - behind_px) <= SAME_SURFACE_PX:
                 continue
-            # The closer of two edges decides.
+            # Of two edges, the closer one decides.
             if hidden_px[at] == NOTHING or abs(at - borders[at]) > abs(k):
                 hidden_px[at], borders[at] = behind_px, seen
 
@@ -121,14 +121,14 @@ def _copy_example(image, disparity_px, nearer_px, hidden_px, colours, origins, b
 @inlined
 @typing.no_type_check
 def _can_continue(disparity_px, nearer_px, origin, side, d):
-    """Whether the pixel after the source of a neighbour's colour can be copied to the next pixel."""
+    """Return whether the pixel after the source of a neighbour's colour can be copied to the next pixel."""
     return _is_example(disparity_px, nearer_px, origin[0], origin[1] - side, d)
 
 
 @inlined
 @typing.no_type_check
 def _is_example(disparity_px, nearer_px, y, x, d):
-    """Whether the pixel is on the surface of disparity d and free of a nearer surface's colour."""
+    """Return whether the pixel is on the surface of disparity d and free of a nearer surface's colour."""
     height, width = disparity_px.shape
     if y < 0 or y >= height or x < 0 or x >= width:
         return False
@@ -140,7 +140,7 @@ def _is_example(disparity_px, nearer_px, y, x, d):
 def _compare_surroundings(
     image, disparity_px, hidden_px, colours, y, x, at_y, at_x, side, compared, first, enough
 ):
-    """Mean squared colour difference between the known neighbours of (y, x) and those of (at_y, at_x)."""
+    """Return the mean squared colour difference between known neighbours of (y, x) and (at_y, at_x)."""
     width = disparity_px.shape[1]
     total, count = 0.0, 0
     for k in range(compared):
@@ -149,7 +149,7 @@ def _compare_surroundings(
         if row < first or like_y < 0 or min(column, like_x) < 0 or max(column, like_x) >= width:
             continue
         seen = hidden_px[row, column] == NOTHING
-        # Neither hidden nor on this surface: foreground.
+        # A pixel that is neither hidden nor on this surface is foreground.
         if seen and abs(disparity_px[row, column] - hidden_px[y, x]) > _ALIKE_PX:
             continue
         count += 1
@@ -165,5 +165,9 @@ def _compare_surroundings(
 @inlined
 @typing.no_type_check
 def _neighbour_offset(k):
-    """Column offset of neighbour k towards the background: 0 beside, 1 to 3 above, from 4 farther beside."""
+    """Return the column offset of neighbour k towards the background.
+
+    Neighbour 0 is beside the pixel, 1 to 3 are in the row above, and those from 4 on are farther along the
+    row.
+    """
     return k - 2 if k > 3 else 1 - (k == 1) - 2 * (k == 3)

@@ -1,4 +1,4 @@
-"""Kernels that blend both images into the new view, where at least one shows a pixel's surface."""
+"""Kernels that blend both images into the new view where at least one of them shows a pixel's surface."""
 
 import typing
 
@@ -8,20 +8,20 @@ from stereoweave.rendering.canvas_kernels import NOTHING, SAME_SURFACE_PX, suppo
 from stereoweave.system.jit import compiled, inlined
 
 RIM = 0.15
-"""Largest support of a surface that is seen in one image only, and there in impure pixels."""
+"""Largest support for a surface that appears in one image only, and only in impure pixels."""
 
 WINDOW_REACH_PX = 2
 """Half size of the alignment window, 5x5 pixels."""
 LARGEST_STEP_PX = np.float32(1)
-"""Largest change of a disparity by the alignment."""
+"""Largest change that the alignment makes to a disparity."""
 FLAT_LEVELS2 = np.float32(30)
 """Regularisation: mean squared grey-level slope below which a window is too flat to align."""
 DOUBLES_REACH_PX = 12
-"""A doubled object is thin: pixels that are not doubled lie within this distance on both sides."""
+"""A doubled object is thin: within this distance on both sides are pixels that are not doubled."""
 AGREED_LEVELS = 30
 """Images agree where they differ by at most this, summed over the channels."""
 ALIKE_LEVELS, UNLIKE_LEVELS = 20, 60
-"""A colour belongs to its surroundings if it differs by at most the first, not if by at least the second."""
+"""Colour differences: at most the first within a surface, at least the second between two surfaces."""
 _HALF, _ONE, _LARGEST = np.float32(0.5), np.float32(1), np.float32(255)
 _LEAST = np.float32(1e-9)
 _1, _2, _3 = np.uint32(1), np.uint32(2), np.uint32(3)
@@ -30,9 +30,10 @@ _1, _2, _3 = np.uint32(1), np.uint32(2), np.uint32(3)
 @compiled
 @typing.no_type_check
 def compare_row(left, right, y, row, sums):
-    """Write the terms of the alignment, sums [3, W] over 5 columns, where both images show the only surface.
+    """Write a row's terms for the alignment, `sums` [3, W], each summed over 5 columns.
 
-    The terms are the grey-level difference times its derivative by disparity, that derivative squared, and 1.
+    The terms are the grey-level difference times its derivative with respect to disparity, that derivative
+    squared, and 1. Columns count where both images show the pixel's only surface.
     """
     width = row.front_px.shape[0]
     left_grey, left_slope, right_grey, right_slope = np.empty((4, width), np.float32)
@@ -55,10 +56,10 @@ def compare_row(left, right, y, row, sums):
 @compiled
 @typing.no_type_check
 def align_row(sums, row):
-    """Refine a row's disparities so that the images align; sums [5, 3, W].
+    """Refine a row's disparities so that the images align, with the terms `sums` [5, 3, W] of 5 rows.
 
-    One Lucas-Kanade step. Without it, matching noise shows as blur, because each image is sampled slightly
-    off the surface.
+    This is one Lucas-Kanade step. Without it, matching noise shows as blur, because each image is sampled
+    slightly off the surface.
     """
     width = row.front_px.shape[0]
     for u in range(width):
@@ -74,7 +75,7 @@ def align_row(sums, row):
 @compiled
 @typing.no_type_check
 def _sample_grey_row(side, y, front_px, grey, slope):
-    """Write an image's grey level at each surface of a row, and its derivative by disparity."""
+    """Write an image's grey level at each surface of a row, and its derivative with respect to disparity."""
     levels = side.grey[y]
     shift, offset_px = np.float32(side.shift), np.float32(side.offset_px)
     width = front_px.shape[0]
@@ -92,7 +93,7 @@ def _sample_grey_row(side, y, front_px, grey, slope):
 @inlined
 @typing.no_type_check
 def _pad(row, padded):
-    """Write a row as float32, padded by one pixel before and three after it."""
+    """Write a row as float32, with its end pixels repeated once before and three times after it."""
     width = row.shape[0]
     for x in range(width):
         padded[x + 1] = row[x]
@@ -103,7 +104,7 @@ def _pad(row, padded):
 @inlined
 @typing.no_type_check
 def _clamp_column(x, width):
-    """Clamp a fractional column to the image."""
+    """Return a fractional column clamped to the image."""
     return min(max(x, np.float32(0)), np.float32(width - 1))
 
 
@@ -129,7 +130,7 @@ def _sample_colour_row(side, y, front_px, padded, colours):
 @inlined
 @typing.no_type_check
 def _cubic_weights(f):
-    """Weights of the pixels at -1, 0, 1 and 2 for a sample at f in 0..1; float32."""
+    """Return the weights, float32, of the pixels at -1, 0, 1 and 2 for a sample at f in 0..1."""
     w0 = ((-_HALF * f + _ONE) * f - _HALF) * f
     w1 = (np.float32(1.5) * f - np.float32(2.5)) * f * f + _ONE
     w3 = (_HALF * f - _HALF) * f * f
@@ -139,9 +140,9 @@ def _cubic_weights(f):
 @compiled
 @typing.no_type_check
 def paint_row(left, right, y, row, canvas):
-    """Write a row's image, pure and surface_px on the canvas.
+    """Write `image`, `pure` and `surface_px` of a canvas row.
 
-    The image is unchanged where neither input image shows the surface.
+    The canvas image is unchanged where neither input image shows the surface.
     """
     front_px, in_left, in_right = row.front_px, row.in_left, row.in_right
     surface_px, image, pure = canvas.surface_px[y], canvas.image[y], canvas.pure[y]
@@ -172,14 +173,14 @@ def paint_row(left, right, y, row, canvas):
 @compiled
 @typing.no_type_check
 def _resolve_doubles(row, left_colours, right_colours, of_left):
-    """Avoid doubling thin objects that both disparity maps have missed: use the image that shows background.
+    """Avoid doubling thin objects that both disparity maps missed: use the image that shows the background.
 
-    Both images show such an object, but at different places before the background. It is recognised where the
-    images differ, although they agree on the same surface on both sides, and one of them continues its
-    colour; the other image shows the object.
+    Both images show such an object, but in front of different parts of the background. It is recognised where
+    the images differ between two places at which they agree on one surface, and one of the images continues
+    the colour of that surface. The other image shows the object.
     """
     width = of_left.shape[0]
-    agreed = np.empty(width, np.int32)  # the last column, up to each, in which both images agree
+    agreed = np.empty(width, np.int32)  # for each column, the last one up to it in which both images agree
     last = -2 * DOUBLES_REACH_PX
     for u in range(width):
         if (
@@ -209,14 +210,14 @@ def _resolve_doubles(row, left_colours, right_colours, of_left):
 @inlined
 @typing.no_type_check
 def _is_shared_surface(row, u):
-    """Whether both images show a pixel's only surface."""
+    """Return whether both images show a pixel's only surface."""
     return min(row.in_left[u], row.in_right[u]) >= _HALF and row.back_px[u] == NOTHING
 
 
 @inlined
 @typing.no_type_check
 def _colour_distance_levels(colours, u, others, v):
-    """Absolute difference of two colours of rows [3, W], summed over the channels."""
+    """Return the absolute difference between two colours of rows [3, W], summed over the channels."""
     red, green, blue = (
         colours[0, u] - others[0, v],
         colours[1, u] - others[1, v],

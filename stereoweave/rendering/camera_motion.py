@@ -1,4 +1,4 @@
-"""Warp of a rendered view to a camera that is also moved up and forward."""
+"""Warping of a rendered view to a camera that is also moved up and forward."""
 
 import numpy as np
 from jaxtyping import Float
@@ -8,23 +8,23 @@ from stereoweave.rendering.canvas_kernels import Canvas, empty_canvas
 from stereoweave.rendering.hole_filling_kernels import fill
 from stereoweave.stereo import StereoCamera
 
-# Limit of the forward motion as a share of a point's depth; closer, the point would fill the image.
+# Limit on forward motion, as a share of a point's depth; beyond it, the point would fill the image.
 _MOST_APPROACH = 0.5
 
 
 def move_camera(canvas: Canvas, camera: StereoCamera, offset_px: float, up: float, forward: float) -> Canvas:
-    """Warp a view to a camera moved up and forward, along the rows first, then along the columns.
+    """Warp a view to a camera moved up and forward: first along the rows, then along the columns.
 
     The depth in baselines is z = focal_px / inverse_px. Forward motion magnifies each point about the
-    principal point by z / (z - forward) = 1 + forward * inverse_px / focal_px, with inverse_px after the
-    motion.
+    principal point by z / (z - forward) = 1 + forward * inverse_px / focal_px, where inverse_px is the value
+    after the motion.
 
     Args:
-        canvas: A view from the line through the cameras, holes filled.
+        canvas: A view from the line through the cameras, with holes filled.
         camera: The left camera.
-        offset_px: The view's principal point relative to the left camera's, to the right.
-        up: In baselines.
-        forward: In baselines.
+        offset_px: Shift of the view's principal point, to the right, from the left camera's.
+        up: Motion up in the image, in baselines.
+        forward: Motion towards the scene, in baselines.
     """
     height, width = canvas.surface_px.shape
     inverse_px = np.maximum(canvas.surface_px + camera.doffs_px, 0)
@@ -40,7 +40,7 @@ def move_camera(canvas: Canvas, camera: StereoCamera, offset_px: float, up: floa
 def _magnify(
     places: np.ndarray, centre_px: float, growth: Float[np.ndarray, "h w"]
 ) -> Float[np.ndarray, "h w"]:
-    """Positions of rows or columns after magnification about a centre by 1 + growth per pixel."""
+    """Return positions of rows or columns, magnified about a centre by each pixel's factor 1 + growth."""
     return places + (places - centre_px) * growth
 
 
@@ -56,5 +56,5 @@ def _move_rows(
 
 
 def _transpose(canvas: Canvas) -> Canvas:
-    """Swap rows and columns."""
+    """Return the canvas with rows and columns swapped."""
     return Canvas(*(np.ascontiguousarray(x.swapaxes(0, 1)) for x in canvas))

@@ -1,4 +1,7 @@
-"""Kernel that warps a view along its rows by a shift per pixel; along its columns, if transposed."""
+"""Kernel that warps a view along its rows, each pixel by its own shift.
+
+Views are transposed to warp them along their columns.
+"""
 
 import math
 import typing
@@ -12,7 +15,7 @@ from stereoweave.system.jit import compiled, kernel
 @kernel
 @typing.no_type_check
 def move(image, surface_px, drawn, targets, disparity_px, canvas):
-    """Move each pixel (y, x) to the fractional column targets[y, x] of the canvas; the nearer one wins.
+    """Move each pixel (y, x) to the fractional column targets[y, x] of the canvas; the nearest surface wins.
 
     Colours are interpolated between neighbours on one surface, so that magnified surfaces have no cracks.
     Pixels on which nothing lands stay impure.
@@ -20,9 +23,9 @@ def move(image, surface_px, drawn, targets, disparity_px, canvas):
     Args:
         image: uint8 RGB [H, W, 3].
         surface_px: float32 [H, W], disparity before the motion; it separates surfaces.
-        drawn: bool [H, W].
-        targets: float32 [H, W].
-        disparity_px: float32 [H, W], after the motion.
+        drawn: bool [H, W]; whether the colour comes from an input image.
+        targets: float32 [H, W], target columns.
+        disparity_px: float32 [H, W], disparity after the motion.
         canvas: Empty canvas, output.
     """
     for y in range(image.shape[0]):
@@ -56,7 +59,10 @@ def _move_row(image, surface_px, drawn, targets, disparity_px, y, canvas):
 @compiled
 @typing.no_type_check
 def _copy(image, surface_px, x, part, colour):
-    """Write the colour between pixel x and the next: cubic if all four are on one surface, else linear."""
+    """Write the colour between pixel x and the next.
+
+    Interpolation is cubic if the four nearest pixels are on one surface, else linear.
+    """
     width = image.shape[0]
     a, b, c, d = max(x - 1, 0), x, min(x + 1, width - 1), min(x + 2, width - 1)
     w0, w1, w2, w3 = 0.0, 1.0 - part, part, 0.0

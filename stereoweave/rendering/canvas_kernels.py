@@ -1,6 +1,6 @@
 """Types and kernels shared by the renderer: input images, canvas, splatting, support.
 
-Reference implementation, which tests compare: tests/helpers/plain_rendering.py.
+Tests compare the kernels with the plain implementation in tests/helpers/plain_rendering.py.
 """
 
 import math
@@ -17,13 +17,13 @@ SAME_SURFACE_PX = np.float32(3)
 FADE_PX = np.float32(2)
 """Further difference over which an image's support for a surface falls to 0."""
 IMPURE = np.float32(0.1)
-"""Weight, relative to a pure pixel, of one that may carry a nearer neighbour's colour."""
+"""Weight of a pixel that may carry a nearer neighbour's colour, relative to a pure pixel."""
 PARTED_PX = np.float32(1)
 """Parallax in the new view above which a nearer neighbour's colour is out of place."""
 
 
 class Side(typing.NamedTuple):
-    """One input image and its maps; arrays are C-contiguous [H, W] unless stated.
+    """One input image and its maps; arrays are C-contiguous [H, W] unless stated otherwise.
 
     Attributes:
         image: uint8 RGB [H, W, 3].
@@ -32,7 +32,8 @@ class Side(typing.NamedTuple):
         nearer_px: float32; largest disparity in the 3x3 window minus the pixel's own.
         shift: -position for the left image, 1 - position for the right one.
         offset_px: Shift of the whole view to the right.
-        nearness: Weight from the distance between its camera and the new one; both images' weights sum to 1.
+        nearness: Weight that falls with the distance from the image's camera to the new one; the weights of
+            both images sum to 1.
     """
 
     image: np.ndarray
@@ -45,7 +46,7 @@ class Side(typing.NamedTuple):
 
 
 class Canvas(typing.NamedTuple):
-    """The new view; arrays are C-contiguous [H, W] unless stated.
+    """The new view; arrays are C-contiguous [H, W] unless stated otherwise.
 
     Attributes:
         surface_px: float32; disparity of the surface that covers most of a pixel, or NOTHING.
@@ -61,7 +62,7 @@ class Canvas(typing.NamedTuple):
 
 
 def empty_canvas(image: np.ndarray) -> Canvas:
-    """Create a canvas that shows an image, uint8 RGB [H, W, 3], in rows that are never drawn."""
+    """Create a canvas without surfaces; it shows `image`, uint8 RGB [H, W, 3], until it is drawn on."""
     size = image.shape[:2]
     return Canvas(
         surface_px=np.full(size, NOTHING, np.float32),
@@ -77,8 +78,8 @@ class SurfaceRow(typing.NamedTuple):
     Attributes:
         front_px: Disparity of the visible surface, or NOTHING.
         back_px: Disparity of a second surface in the pixel, or NOTHING.
-        share: Part of the pixel that the front covers, 0..1; the back covers the rest.
-        in_left, in_right: Support of the front in each input image, 0..1.
+        share: Part of the pixel that the front surface covers, 0..1; the back surface covers the rest.
+        in_left, in_right: Support of the left and of the right image for the front surface, 0..1.
     """
 
     front_px: np.ndarray
@@ -97,7 +98,7 @@ def splat_row(disparity_px, shift, offset_px, landed_px):
     """Write to landed_px [W] the nearest disparity that lands on each pixel of the new view, or NOTHING.
 
     Disparity is interpolated linearly between neighbours on one surface, so that slanted and magnified
-    surfaces have no cracks. The pixels at a surface's edge reach half a pixel further.
+    surfaces have no cracks. Pixels at the edge of a surface reach half a pixel farther.
     """
     width = disparity_px.shape[0]
     landed_px[:] = NOTHING
@@ -143,16 +144,16 @@ def sample_linear(row, x):
 @inlined
 @typing.no_type_check
 def lies_on(apart_px):
-    """1 up to SAME_SURFACE_PX from a surface, falling to 0 over FADE_PX; float32."""
+    """Return a pixel's weight: 1 up to SAME_SURFACE_PX from a surface, falling to 0 over FADE_PX."""
     return min(_ONE, max(_ZERO, _ONE + (SAME_SURFACE_PX - abs(apart_px)) / FADE_PX))
 
 
 @inlined
 @typing.no_type_check
 def purity(shift, nearer_px):
-    """1, falling to IMPURE where a pixel may carry a nearer neighbour's colour; float32.
+    """Return a pixel's weight: 1, falling to IMPURE where it may carry a nearer neighbour's colour.
 
-    That colour counts once the parallax between the two in the new view exceeds PARTED_PX.
+    The weight falls once the parallax between pixel and neighbour in the new view exceeds PARTED_PX.
     """
     return min(_ONE, max(IMPURE, _ONE + PARTED_PX - abs(shift) * nearer_px))
 
@@ -183,7 +184,10 @@ def support_in_row(side, y, front_px, support):
 @inlined
 @typing.no_type_check
 def support_at(disparity_px, nearer_px, shift, x, d):
-    """Support for the surface of disparity d at an image row's fractional column x; see `support_in_row`."""
+    """Return an image row's support, at the fractional column x, for the surface of disparity d.
+
+    See `support_in_row`.
+    """
     last = disparity_px.shape[0] - 1
     if x < -0.5 or x > last + 0.5:
         return 0.0

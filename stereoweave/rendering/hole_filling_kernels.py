@@ -15,12 +15,12 @@ NARROW_PX = 8
 def paint_background(hidden_px, colours, shift, offset_px, canvas):
     """Paint the hidden background (`background_kernels.uncover`) where the canvas has no pure colour.
 
-    Impure pixels farther than that background keep their colour, so that a gap in a fence stays open.
+    Impure pixels farther away than that background keep their colour, so that a gap in a fence stays open.
     """
     height, width = hidden_px.shape
     for y in range(height):
         for k in range(width):
-            # Visit the nearest first among those that land on one pixel, so that each is painted once.
+            # Visit the nearest of the pixels that land on one place first, so that the place is painted once.
             x = k if shift > 0 else width - 1 - k
             d = hidden_px[y, x]
             if d == NOTHING:
@@ -38,7 +38,7 @@ def paint_background(hidden_px, colours, shift, offset_px, canvas):
 @compiled
 @typing.no_type_check
 def _mix(hidden_px, colours, x, beyond, colour):
-    """Write the colour interpolated `beyond` pixels from the hidden pixel x, towards its neighbour there."""
+    """Write the colour `beyond` pixels from the hidden pixel x, interpolated with its neighbour."""
     beside = x + (1 if beyond > 0 else -1)
     part = abs(beyond)
     if beside < 0 or beside >= hidden_px.shape[0] or abs(hidden_px[beside] - hidden_px[x]) > SAME_SURFACE_PX:
@@ -51,11 +51,11 @@ def _mix(hidden_px, colours, x, beyond, colour):
 @kernel
 @typing.no_type_check
 def fill(canvas):
-    """Fill every run of pixels that are still impure from the surface beside its farther end.
+    """Fill every run of pixels that are still impure, from the farther of the two surfaces beside it.
 
-    A narrow run gets one mean colour, which has the least error. A wide run gets the texture mirrored at that
-    end, as does a run at the image border, which has one end only. As in `paint_background`, impure pixels
-    farther than that surface keep their colour.
+    A narrow run gets the mean colour of that surface, which has the least error. A wide run gets its mirrored
+    texture, as does a run at the image border, which has a surface on one side only. As in
+    `paint_background`, impure pixels farther away than that surface keep their colour.
     """
     surface_px, pure, drawn = canvas.surface_px, canvas.pure, canvas.drawn
     height, width = pure.shape
@@ -83,7 +83,10 @@ def fill(canvas):
 @compiled
 @typing.no_type_check
 def _average_beside(canvas, y, column, inwards):
-    """Mean colour of the surface at (y, column) over two columns and three rows; its own row counts twice."""
+    """Return the mean colour of the surface at (y, column).
+
+    The mean is over two columns and three rows, of which row y counts twice.
+    """
     height, width = canvas.pure.shape
     here_px = canvas.surface_px[y, column]
     red = green = blue = total = 0.0
@@ -101,7 +104,7 @@ def _average_beside(canvas, y, column, inwards):
 @compiled
 @typing.no_type_check
 def _fill_pixel(canvas, y, u, source, colour, mirrors):
-    """Write the pixel mirrored at the source if it is on the source's surface, else a plain colour."""
+    """Fill a pixel from its mirror image about `source` if both are on one surface, else with `colour`."""
     width = canvas.pure.shape[1]
     mirrored = min(max(2 * source - u, 0), width - 1)
     apart_px = abs(canvas.surface_px[y, mirrored] - canvas.surface_px[y, source])

@@ -75,8 +75,8 @@ class LayoutOptions:
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < 1 or not 2 <= self.columns * self.rows <= _MOST_VIEWS:
             raise StereoweaveError(
-                f"quilt: expected columns and rows of 2 to {_MOST_VIEWS} views, "
-                f"got {self.columns}x{self.rows}; displays take 5x9, 8x6, 7x7 and 11x6"
+                f"quilt: expected columns and rows for 2 to {_MOST_VIEWS} views, "
+                f"got {self.columns}x{self.rows}; displays use 5x9, 8x6, 7x7 or 11x6"
             )
         if self.range_px is not None and not -math.inf < self.range_px[0] < self.range_px[1] < math.inf:
             raise StereoweaveError(
@@ -92,7 +92,8 @@ class Layout:
     Attributes:
         compose: Function that returns the image, uint8 RGB.
         positions: The outermost positions of its views.
-        converged: Whether views are overlaid or compared in place, so that mid-scene should have no parallax.
+        converged: Whether views are overlaid or compared in place, so the middle of the scene should have no
+            parallax.
         mark: File name suffix by which viewers detect the layout.
     """
 
@@ -109,7 +110,8 @@ class Animation:
     Attributes:
         positions: Position of each frame of one turn.
         frame_ms: Duration of a frame; a multiple of 10, the unit of GIF.
-        mp4_turns: Number of turns in an MP4 file, since players do not loop it.
+        mp4_turns: Number of turns in an MP4 file, which players do not loop.
+        converged: As in `Layout`.
     """
 
     positions: tuple[float, ...]
@@ -118,7 +120,7 @@ class Animation:
     converged: bool = True
 
     def turns(self, path: str | Path) -> int:
-        """Number of turns in a file of this format."""
+        """Return the number of turns in a file with this ending."""
         return self.mp4_turns if check_animation_ending(path) == ".mp4" else 1
 
 
@@ -128,32 +130,35 @@ def render_views(renderer: Renderer, positions: Iterable[float]) -> Iterator[UIn
 
 
 def side_by_side(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
-    """Both eyes' views, the left eye's on the left: twice the width."""
+    """Return both eyes' views side by side, the left eye's on the left, at twice the width."""
     return np.hstack(_render_eyes(renderer))
 
 
 def side_by_side_half(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
-    """Both eyes' views side by side, each at half its width; an odd width repeats the last column."""
+    """Return both eyes' views side by side, each at half width; an odd width repeats its last column."""
     return np.hstack([_halve(eye, axis=1) for eye in _render_eyes(renderer)])
 
 
 def crossed(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
-    """Both eyes' views, the right eye's on the left, for cross-eyed viewing."""
+    """Return both eyes' views side by side, the right eye's on the left, for cross-eyed viewing."""
     return np.hstack(_render_eyes(renderer)[::-1])
 
 
 def top_bottom(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
-    """Both eyes' views, the left eye's on top: twice the height."""
+    """Return both eyes' views one above the other, the left eye's on top, at twice the height."""
     return np.vstack(_render_eyes(renderer))
 
 
 def top_bottom_half(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
-    """Both eyes' views, the left eye's on top, each at half height; an odd height repeats its last row."""
+    """Return both eyes' views, the left eye's on top, each at half height.
+
+    An odd height repeats its last row.
+    """
     return np.vstack([_halve(eye, axis=0) for eye in _render_eyes(renderer)])
 
 
 def make_anaglyph(kind: str) -> Callable[[Renderer, LayoutOptions], np.ndarray]:
-    """Return the `compose` function of a red-cyan anaglyph, red for the left eye; `kind` in `_ANAGLYPHS`."""
+    """Return the `compose` function of a red-cyan anaglyph, red for the left eye; see `_ANAGLYPHS`."""
     shares = [np.array(matrix, np.float32) for matrix in _ANAGLYPHS[kind]]
 
     def compose(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
@@ -168,7 +173,7 @@ def make_anaglyph(kind: str) -> Callable[[Renderer, LayoutOptions], np.ndarray]:
 
 
 def rgbd(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
-    """The left image beside its disparity in grey, near is white: twice the width.
+    """Return the left image beside its disparity in grey, where white is near, at twice the width.
 
     Strength and convergence have no effect: RGB-D displays render views themselves.
     """
@@ -180,7 +185,7 @@ def rgbd(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3
 
 
 def quilt(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
-    """Views in rows from left to right, the first at the bottom left, the last at the top right.
+    """Return a quilt: rows of views from left to right, from the bottom left to the top right.
 
     Views are scaled down if a side of the quilt would exceed 8192 px. Source: Looking Glass's quilt
     definition.
@@ -192,12 +197,12 @@ def quilt(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 
 
 
 def contact_sheet(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
-    """Nine views from -0.5 to 1.5 in reading order, each at a third of its size."""
+    """Return nine views from positions -0.5 to 1.5 in reading order, each at a third of its size."""
     return _join_tiles(_render_tiles(renderer, _SHEET_SIDE, _SHEET_SIDE, _SHEET_SIDE))
 
 
 def _swing_positions(count: int) -> tuple[float, ...]:
-    """Positions from 0 to 1 and back along a cosine, slow at both ends."""
+    """Return positions from 0 to 1 and back along a cosine, slow at both ends."""
     return tuple((0.5 - 0.5 * np.cos(2 * np.pi * np.arange(count) / count)).tolist())
 
 
@@ -234,7 +239,7 @@ def choose_layout(path: str | Path, name: str | None) -> str | None:
     """Return the layout of an output file, given by name or by the file's ending; None for a single view.
 
     Raises:
-        StereoweaveError: Unknown layout, or one that does not fit the file's ending.
+        StereoweaveError: The layout is unknown, or does not fit the file's ending.
     """
     if name is not None and name not in LAYOUTS | ANIMATIONS:
         raise StereoweaveError(
@@ -260,24 +265,24 @@ def check_positions(positions: Iterable[float], strength: float) -> None:
         if not FIRST_POSITION <= seen_from <= LAST_POSITION:
             by_strength = "" if strength == 1 else f", position {position:g} at strength {strength:g}"
             raise StereoweaveError(
-                f"expected {FIRST_POSITION:g} to {LAST_POSITION:g} (0 left camera, 1 right), "
+                f"expected {FIRST_POSITION:g} to {LAST_POSITION:g} (0 is the left camera, 1 the right), "
                 f"got {seen_from:g}{by_strength}",
                 setting="position",
             )
 
 
 def median_disparity_px(estimate: Estimate) -> float:
-    """Median disparity in px, weighted by confidence: the middle of the scene."""
-    # Not 0, so that a pair without any confidence has a median too.
+    """Return the median disparity in px, weighted by confidence: the middle of the scene."""
+    # Weights are above 0, so that even a pair without any confidence has a median.
     weights = np.maximum(estimate.confidence, 1e-6)
     return float(np.quantile(estimate.disparity_px, 0.5, weights=weights, method="inverted_cdf"))
 
 
 def add_mark(path: str | Path, name: str, pair: StereoPair, choices: LayoutOptions) -> Path:
-    """Append the suffix by which viewers detect the layout to the file name, unless it is already there.
+    """Return a path whose file name ends in the suffix by which viewers detect the layout.
 
     A quilt's suffix gives columns, rows, and the aspect ratio of one view: view_qs8x6a0.75.png. An .mpo or
-    .jps file needs none.
+    .jps file needs no suffix.
     """
     path = Path(path)
     if path.suffix.lower() in _LAYOUT_BY_ENDING:
@@ -307,12 +312,12 @@ def write_picture(path: str | Path, picture: UInt8[np.ndarray, "h w 3"]) -> None
 
 
 def _render_eyes(renderer: Renderer) -> list[UInt8[np.ndarray, "h w 3"]]:
-    """Render the left eye's view and the right eye's."""
+    """Render the views of the left and the right eye."""
     return list(render_views(renderer, (0.0, 1.0)))
 
 
 def _halve(eye: UInt8[np.ndarray, "h w 3"], axis: int) -> UInt8[np.ndarray, "h2 w2 3"]:
-    """Halve one side by averaging neighbours; an odd side is padded with a copy of its last row or column."""
+    """Halve an image along an axis by averaging neighbours; an odd side repeats its last row or column."""
     odd = [(0, side % 2 * (index == axis)) for index, side in enumerate(eye.shape)]
     even = np.pad(eye, odd, "edge")
     height, width = even.shape[:2]
@@ -323,7 +328,7 @@ def _halve(eye: UInt8[np.ndarray, "h w 3"], axis: int) -> UInt8[np.ndarray, "h2 
 def _render_tiles(
     renderer: Renderer, columns: int, rows: int, smaller: float
 ) -> UInt8[np.ndarray, "rows h columns w 3"]:
-    """Render views across the whole range of positions, reduced by the factor `smaller`, in reading order."""
+    """Render tiles of evenly spaced views in reading order, each scaled down by the factor `smaller`."""
     height, width = (max(1, int(side / smaller)) for side in renderer.pair.left.shape[:2])
     tiles = np.empty((rows, height, columns, width, 3), np.uint8)
     for index, view in enumerate(render_views(renderer, np.linspace(*_FAN, rows * columns).tolist())):

@@ -25,7 +25,7 @@ _LEAST_NEARNESS = 1e-3
 # Rows per band when background is uncovered, independent of the number of threads.
 _BAND_ROWS = 60
 _FARTHEST_MOVE = 1.0
-# Percentile of disparity taken as infinity; matching errors lie below it.
+# Percentile of the disparity that is taken as infinitely far; matching errors lie below it.
 _FAR_PERCENT = 1
 
 
@@ -67,7 +67,7 @@ class Renderer:
         Args:
             position: -1 to 2 after `strength` is applied.
             up: Distance above the line through the cameras, in baselines; -1 to 1.
-            forward: Distance in front of it, towards the scene, in baselines; -1 to 1.
+            forward: Distance from that line towards the scene, in baselines; -1 to 1.
         """
         check_number("position", position)
         position = 0.5 + self.strength * (position - 0.5)
@@ -86,12 +86,13 @@ class Renderer:
         return View(image=canvas.image, drawn=canvas.drawn)
 
     def _draw(self, position: float) -> "Canvas":
-        """Render the view from a position on the line through the cameras, holes filled."""
+        """Render the view from a position on the line through the cameras, with holes filled."""
         from stereoweave.rendering.canvas_kernels import empty_canvas
         from stereoweave.rendering.draw_kernels import draw  # Numba takes half a second to import
         from stereoweave.rendering.hole_filling_kernels import fill, paint_background
 
-        # The square root averages more, for less noise: +0.03 dB on rendered views, +0.1 dB on Venus.
+        # The square root averages both images more, which lowers noise: +0.03 dB on rendered views, +0.1 dB
+        # on Venus.
         shares = abs(1 - position) ** 0.5, abs(position) ** 0.5
         tables = self._looks.tables(position) if self._looks else (None, None)
         colours = [_recolour(side.image, table) for side, table in zip(self._sides, tables, strict=True)]
@@ -109,14 +110,14 @@ class Renderer:
         work = partial(draw, left, right, self._confidence, canvas)
         in_bands(work, len(canvas.image), self._threads, self._threads)
         if not 0 <= position <= 1:
-            # Holes of views between the cameras are a few pixels wide: `fill` alone is faster and as good.
+            # Between the cameras, holes are a few pixels wide: `fill` alone is faster and as good.
             hidden = self._find_background(right=position > 1)
             paint_background(*hidden, (right if position > 1 else left).shift, left.offset_px, canvas)
         fill(canvas)
         return canvas
 
     def _find_background(self, right: bool) -> "HiddenBackground":
-        """Background seen by neither camera but visible from beyond one of them; cached."""
+        """Return the background seen by neither camera but visible from beyond one of them; it is cached."""
         if right not in self._hidden:
             self._hidden[right] = _uncover_background(self._sides, right, self._threads)
         return self._hidden[right]
@@ -145,11 +146,11 @@ def render(  # noqa: PLR0913 - the options of one view
     """Render the view from a position on the line through the two cameras, or beside it, from both images.
 
     Both disparity maps are splatted to the new view; the nearer surface wins. Each pixel samples both images
-    at its surface. The weights depend on the distance to each camera and on whether the image's own disparity
-    agrees; where the camera's line of sight is blocked, it does not. Where the two maps contradict each
-    other, their confidence and the similarity of the images decide. Holes, seen by neither camera, continue
-    the farther side. Differences in exposure and colour are removed: the view has the colours of the left
-    image at position 0, those of the right image at 1, and a blend in between.
+    at its surface. An image's weight depends on the distance to its camera and on whether its own disparity
+    agrees, which it does not where the camera's line of sight is blocked. Where the two maps contradict each
+    other, their confidence and the similarity of the images decide. Holes, which neither camera sees, are
+    filled from their farther side. Differences in exposure and colour are removed: the view has the colours
+    of the left image at position 0, those of the right image at 1, and a blend in between.
 
     To render many views of one pair, use `Renderer`.
 
@@ -162,12 +163,13 @@ def render(  # noqa: PLR0913 - the options of one view
         strength: Factor on the baseline about its middle, as in `Renderer`.
         convergence_px: Disparity of the plane that stays in place in all views.
         up: Distance above the line through the cameras, in baselines; -1 to 1.
-        forward: Distance in front of it, towards the scene, in baselines; -1 to 1.
+        forward: Distance from that line towards the scene, in baselines; -1 to 1.
         camera: Focal length, principal point and doffs for `up` and `forward`. Default: a focal length equal
             to the image width.
 
     Returns:
-        The view, of the images' size; `drawn` is False in filled holes. At 0 and 1 it is the image itself.
+        The view, of the images' size; `drawn` is False in filled holes. The view from 0 or 1 is the image
+        itself.
 
     Raises:
         ValueError: The sizes differ, or a number is out of range.
@@ -183,13 +185,14 @@ def check_position(position: float, *, up: float = 0.0, forward: float = 0.0) ->
         check_number(name, value)
     if not FIRST_POSITION <= position <= LAST_POSITION:
         raise StereoweaveError(
-            f"expected {FIRST_POSITION} to {LAST_POSITION} (0 left camera, 1 right), got {position}",
+            f"expected {FIRST_POSITION} to {LAST_POSITION} (0 is the left camera, 1 the right), "
+            f"got {position}",
             setting="position",
         )
     for name, value in (("up", up), ("forward", forward)):
         if not abs(value) <= _FARTHEST_MOVE:
             raise StereoweaveError(
-                f"expected -{_FARTHEST_MOVE:g} to {_FARTHEST_MOVE:g} (baselines), got {value}", setting=name
+                f"expected -{_FARTHEST_MOVE:g} to {_FARTHEST_MOVE:g} baselines, got {value}", setting=name
             )
 
 
@@ -207,7 +210,7 @@ def _check_shifts(strength: float, convergence_px: float, pair: StereoPair) -> N
 
 
 def _make_side(image: UInt8[np.ndarray, "h w 3"], disparity_px: Float[np.ndarray, "h w"]) -> "Side":
-    """Pack an input image and its maps for the kernels, before a view is chosen."""
+    """Pack an input image and its maps for the kernels; the fields that depend on the view are 0."""
     from stereoweave.rendering.canvas_kernels import Side
 
     # Numba compiles a second version of every kernel for read-only or non-contiguous arrays.
@@ -227,7 +230,7 @@ def _make_side(image: UInt8[np.ndarray, "h w 3"], disparity_px: Float[np.ndarray
 def _recolour(
     image: UInt8[np.ndarray, "h w 3"], table: Float[np.ndarray, "256 3"] | None
 ) -> dict[str, np.ndarray]:
-    """Apply a colour table to a side's image and grey levels; return no change without a table."""
+    """Return a side's image and grey levels after recolouring with a table; empty without a table."""
     if table is None:
         return {}
     coloured = recolour(image, table)
@@ -235,9 +238,9 @@ def _recolour(
 
 
 def _assume_camera(estimate: Estimate) -> StereoCamera:
-    """Camera with a horizontal field of view of 53 degrees and a centred principal point.
+    """Return a camera with a horizontal field of view of 53 degrees and a centred principal point.
 
-    Negative disparities mean converged cameras; the least disparity is then taken as infinitely far.
+    Negative disparities mean converged cameras; the lowest disparities are then taken as infinitely far.
     """
     height, width = estimate.disparity_px.shape
     return StereoCamera(

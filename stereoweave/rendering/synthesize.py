@@ -20,7 +20,7 @@ def synthesize(  # noqa: PLR0913 - all but the first three are optional
     *,
     provider: str = CPU,
 ) -> View:
-    """Estimate the disparity of a rectified pair, refined, and render the view from a position.
+    """Estimate the refined disparity of a rectified pair and render the view from a position.
 
     Args:
         left: Left image, uint8 RGB [H, W, 3].

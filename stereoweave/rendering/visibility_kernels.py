@@ -16,7 +16,7 @@ from stereoweave.rendering.canvas_kernels import (
 from stereoweave.system.jit import compiled, inlined
 
 NOISE_LEVELS = 10.0
-"""Noise of the difference between the images, summed over the channels, when two surfaces are compared."""
+"""Noise in the difference between the images, summed over the channels, when two surfaces are compared."""
 PRIOR = 0.3
 """Weight of a disparity with confidence 0; one with confidence 1 weighs about four times as much."""
 
@@ -24,9 +24,9 @@ PRIOR = 0.3
 @compiled
 @typing.no_type_check
 def choose_row(left, right, confidence, y, landed_left, landed_right, row):
-    """Write the surface of every pixel in a row, and a second surface with its share where there are two.
+    """Write the visible surface of every pixel in a row; where there are two, write both and their shares.
 
-    There are two where the maps contradict each other, and where a nearer surface ends within the pixel.
+    A pixel has two surfaces where the maps contradict each other, and where a nearer surface ends within it.
     """
     front_px, back_px = row.front_px, row.back_px
     width = front_px.shape[0]
@@ -60,7 +60,10 @@ def choose_row(left, right, confidence, y, landed_left, landed_right, row):
 @compiled
 @typing.no_type_check
 def _measure_coverage(side, y, u, d):
-    """Support of an image for the surface of disparity d at (y, u), pure or not: 0..1, 0 outside."""
+    """Return an image's support, 0..1, for the surface of disparity d at (y, u), ignoring purity.
+
+    The support is 0 outside the image.
+    """
     last = side.disparity_px.shape[1] - 1
     x = _column(side.shift, side.offset_px, u, d)
     if x < -0.5 or x > last + 0.5:
@@ -74,14 +77,17 @@ def _measure_coverage(side, y, u, d):
 @inlined
 @typing.no_type_check
 def _column(shift, offset_px, u, d):
-    """Fractional column of an image that shows disparity d at column u of the new view."""
+    """Return an image's fractional column that corresponds to column u of the new view at disparity d."""
     return u - offset_px - shift * d
 
 
 @compiled
 @typing.no_type_check
 def _find_left_share(left, right, confidence, y, u, a, b):
-    """Share, 0..1, of the left map's surface a where the maps disagree; the rest is b, the right map's."""
+    """Return the share, 0..1, of the left map's surface where the maps disagree.
+
+    The right map's surface has the rest. Their disparities are a and b.
+    """
     gap_a_px = _find_gap_px(right, y, u, a)
     gap_b_px = _find_gap_px(left, y, u, b)
     # The nearer surface occludes the other one, unless the other camera looks through it.
@@ -91,7 +97,7 @@ def _find_left_share(left, right, confidence, y, u, a, b):
         return 0.0
     trust_a = sample_linear(confidence[y], _column(left.shift, left.offset_px, u, a))
     trust_b = sample_linear(confidence[y], _column(left.shift, left.offset_px, u, b))
-    # Confidence refers to the left map, which may differ at b: a nearer surface there says nothing about b, a
+    # Confidence refers to the left map, which may differ from b: a nearer surface says nothing about b, a
     # farther one contradicts it.
     if gap_b_px > SAME_SURFACE_PX:
         trust_b = 0.5
@@ -109,7 +115,10 @@ def _find_left_share(left, right, confidence, y, u, a, b):
 @compiled
 @typing.no_type_check
 def _find_gap_px(side, y, u, d):
-    """Disparity of this image's surface there minus d, at the more similar of two pixels; 0 outside."""
+    """Return an image's disparity minus d at the column that corresponds to u; 0 outside the image.
+
+    Of the two pixels at that fractional column, the one whose disparity is closer to d counts.
+    """
     last = side.disparity_px.shape[1] - 1
     x = _column(side.shift, side.offset_px, u, d)
     if x < 0 or x > last:
@@ -123,7 +132,10 @@ def _find_gap_px(side, y, u, d):
 @compiled
 @typing.no_type_check
 def _measure_mismatch(left, right, y, u, d):
-    """Images' mean difference over three pixels around u at disparity d, channels summed; -1 outside."""
+    """Return the mean difference between the images over three pixels around u at disparity d.
+
+    The difference is summed over the channels; it is -1 outside the images.
+    """
     left_image, right_image = left.image[y], right.image[y]
     last = left_image.shape[0] - 1
     total, count = 0.0, 0
@@ -145,7 +157,7 @@ def _measure_mismatch(left, right, y, u, d):
 @compiled
 @typing.no_type_check
 def _sum_support(left, right, y, u, d):
-    """Weighted support of both images for the surface of disparity d at (y, u) of the new view."""
+    """Return the weighted support of both images for the surface of disparity d at (y, u) of the new view."""
     total = 0.0
     for side in (left, right):
         x = _column(side.shift, side.offset_px, u, d)

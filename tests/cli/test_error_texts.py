@@ -53,7 +53,9 @@ ERRORS = {
     "depth --left none*.png --right right*.png -o out": "--left: expected pictures that match none*.png, "
     "found none; quote the pattern",
     "batch . out --gpus-each 1.5": "--gpus-each: expected 0, a fraction of 1 or a whole number, found 1.5",
-    f"view {PAIR} --position 3 -o out.png": "--position: expected -1 to 2 (0 left camera, 1 right), got 3",
+    f"view {PAIR} --position 3 -o out.png": (
+        "--position: expected -1 to 2 (0 is the left camera, 1 the right), got 3"
+    ),
     f"view {PAIR} --layout diagonal -o out.png": "--layout: expected one of "
     f"{', '.join([*VIEW_LAYOUTS, *ANIMATIONS])}, found 'diagonal'",
     "video plain.png -o out.mp4": "expected one kind of output, found none; choose one (--depth, "

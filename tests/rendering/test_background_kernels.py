@@ -13,7 +13,7 @@ OBJECT = np.array([250, 30, 10], np.uint8)
 
 
 def wall_with_object(wall):
-    """A pair of a wall at disparity 2 of the texture `wall` [H, 60, 3], and an object at 10 before it."""
+    """Return a pair that shows the texture `wall` [H, 60, 3] at disparity 2 and an object at 10 before it."""
     left, right = wall.copy(), np.roll(wall, -WALL_PX, axis=1)
     maps = np.full((2, *wall.shape[:2]), WALL_PX, np.float32)
     left[:, 20:46], right[:, 10:36] = OBJECT, OBJECT
@@ -32,15 +32,15 @@ def uncovered(photo, disparity_px, other_px, side):
 
 
 def stripes(period, height=8):
-    """Vertical stripes, a column each of a shade of its own."""
+    """Return vertical stripes one column wide, in `period` shades."""
     shades = np.tile(40 * np.arange(period, dtype=np.uint8), 60)[:60]
     return np.repeat(np.tile(shades, (height, 1))[..., None], 3, axis=2)
 
 
-def test_the_wall_goes_on_behind_the_object_as_far_as_a_camera_one_baseline_away_looks():
+def test_the_wall_continues_behind_the_object_as_far_as_a_camera_one_baseline_away_sees():
     left, _, maps = wall_with_object(stripes(4))
     hidden_px, _ = uncovered(left, *maps, -1)
-    # From the object's rim, 19, to 8 px behind its border, and one more. The right camera sees 38 and more.
+    # From the object's rim, 19, to 9 px behind its border. The right camera sees the columns from 38 on.
     expected = np.full((8, 60), NOTHING)
     expected[:, 19:29] = WALL_PX
     np.testing.assert_array_equal(hidden_px, expected)
@@ -55,23 +55,23 @@ def test_what_the_other_camera_sees_is_not_hidden():
 
 
 @pytest.mark.parametrize("period", [3, 4, 5])
-def test_stripes_go_on_in_step(period):
+def test_hidden_stripes_continue_in_phase(period):
     wall = stripes(period)
     left, _, maps = wall_with_object(wall)
     hidden_px, colours = uncovered(left, *maps, -1)
     hidden = hidden_px > NOTHING
-    # The first row has none above it to follow.
+    # The first row has no row above to continue.
     np.testing.assert_array_equal(colours[1:][hidden[1:]], wall[1:][hidden[1:]])
 
 
-def test_rows_of_one_colour_go_on(rng):
+def test_rows_of_one_colour_continue(rng):
     wall = np.tile(rng.integers(0, 200, (8, 1, 3), dtype=np.uint8), (1, 60, 1))
     left, _, maps = wall_with_object(wall)
     hidden_px, colours = uncovered(left, *maps, -1)
     np.testing.assert_array_equal(colours[hidden_px > NOTHING], wall[hidden_px > NOTHING])
 
 
-def test_colours_are_the_walls_and_never_the_objects(rng):
+def test_hidden_colours_come_from_the_wall_and_never_from_the_object(rng):
     wall = rng.integers(0, 200, (12, 60, 3), dtype=np.uint8)
     left, right, maps = wall_with_object(wall)
     for photo, own, other, side in ((left, 0, 1, -1), (right, 1, 0, 1)):
@@ -81,7 +81,7 @@ def test_colours_are_the_walls_and_never_the_objects(rng):
         assert {tuple(colour) for colour in colours[hidden_px > NOTHING]} <= seen
 
 
-def test_the_right_photograph_mirrored_gives_what_the_left_one_gives(rng):
+def test_the_mirrored_right_image_gives_the_mirrored_result_of_the_left_one(rng):
     wall = rng.integers(0, 200, (9, 60, 3), dtype=np.uint8)
     left, _, maps = wall_with_object(wall)
     expected = uncovered(left, *maps, -1)[0]
@@ -89,7 +89,7 @@ def test_the_right_photograph_mirrored_gives_what_the_left_one_gives(rng):
     np.testing.assert_array_equal(found[:, ::-1], expected)
 
 
-def test_what_is_invented_stays_the_same_from_view_to_view(rng):
+def test_filled_background_is_the_same_in_all_views(rng):
     wall = rng.integers(0, 200, (9, 60, 3), dtype=np.uint8)
     left, right, maps = wall_with_object(wall)
     estimate = Estimate(
@@ -100,14 +100,14 @@ def test_what_is_invented_stays_the_same_from_view_to_view(rng):
     )
     renderer = Renderer(StereoPair(left=left, right=right), estimate)
     near, far = renderer.view(-0.5), renderer.view(-1.0)
-    # The wall is at x + 1 and at x + 2, the object's border at 25 and at 30.
+    # In the two views, the wall is at x + 1 and x + 2, and the object's border at 25 and 30.
     assert not near.drawn[:, 21:25].any()
     assert not far.drawn[:, 22:30].any()
     np.testing.assert_array_equal(near.image[:, 21:25], far.image[:, 22:26])
 
 
 @pytest.mark.parametrize(("position", "first"), [(-0.5, 21), (1.5, 31)])
-def test_in_a_view_from_beyond_the_hidden_stripes_go_on_in_step(position, first):
+def test_in_a_view_from_beyond_a_camera_hidden_stripes_continue_in_phase(position, first):
     wall = stripes(4)
     left, right, maps = wall_with_object(wall)
     estimate = Estimate(
@@ -117,21 +117,21 @@ def test_in_a_view_from_beyond_the_hidden_stripes_go_on_in_step(position, first)
         occluded=np.zeros(maps[0].shape, bool),
     )
     view = Renderer(StereoPair(left=left, right=right), estimate).view(position)
-    # The object is at 25..50, or at 5..30; beside it is what neither camera saw.
+    # The object is at 25..50 or at 5..30; beside it is background that neither camera saw.
     hidden = np.s_[1:, first : first + 4]
     assert not view.drawn[hidden].any()
     expected = np.roll(wall, round(-WALL_PX * position), axis=1)
     np.testing.assert_array_equal(view.image[hidden], expected[hidden])
 
 
-def test_a_plain_picture_hides_nothing():
+def test_an_image_without_depth_edges_hides_nothing():
     flat = np.full((4, 60), WALL_PX, np.float32)
     hidden_px, _ = uncovered(stripes(4, 4), flat, flat, -1)
     assert (hidden_px == NOTHING).all()
 
 
 def random_hidden(rng, height=40, width=50):
-    """Bands of hidden background at several depths, their colours, and a canvas with gaps and rims."""
+    """Return bands of hidden background at several depths, their colours, and a canvas with gaps and rims."""
     bands = np.repeat(rng.choice([NOTHING, 1.0, 3.0, 9.0, 14.0], (height, width // 5)), 5, axis=1)
     hidden_px = np.where(bands > NOTHING, bands + rng.normal(0, 0.4, (height, width)), NOTHING)
     drawn_on = np.repeat(rng.random((height, width // 5)) < 0.6, 5, axis=1)
@@ -146,7 +146,7 @@ def random_hidden(rng, height=40, width=50):
 
 @pytest.mark.parametrize("shift", [1.0, 0.4, -0.4, -1.0])
 @pytest.mark.parametrize("offset_px", [0.0, -2.3])
-def test_the_fast_laying_equals_the_plain_one(rng, shift, offset_px):
+def test_the_fast_painting_of_background_equals_the_plain_one(rng, shift, offset_px):
     hidden_px, colours, canvas = random_hidden(rng)
     expected = plain_lay(hidden_px, colours, shift, offset_px, canvas)
     paint_background(hidden_px, colours, shift, offset_px, canvas)
@@ -157,7 +157,7 @@ def test_the_fast_laying_equals_the_plain_one(rng, shift, offset_px):
 
 
 @pytest.mark.parametrize(("shift", "near_at", "far_at"), [(1.0, 12, 20), (-1.0, 30, 22)])
-def test_hidden_background_is_laid_only_where_none_is_nearer(shift, near_at, far_at):
+def test_hidden_background_is_painted_only_where_nothing_is_nearer(shift, near_at, far_at):
     # At disparity 10 and at 2, both land on column 22 from the left, or on 20 from the right.
     hidden_px, colours = np.full((1, 40), NOTHING), np.zeros((1, 40, 3), np.uint8)
     hidden_px[0, near_at], hidden_px[0, far_at] = 10, 2

@@ -18,7 +18,7 @@ def estimate_of(disparity_px, right_disparity_px):
 
 
 def flat(rng, disparity_px, camera=None, height=60, width=90):
-    """A wall at one disparity, of soft noise, whose right photograph is the left one moved."""
+    """Return a renderer of a wall of soft noise at one disparity; the right image is the left one shifted."""
     coarse = rng.integers(0, 256, (height // 6, width // 6, 3)).astype(np.float32)
     left = np.repeat(np.repeat(coarse, 6, axis=0), 6, axis=1).astype(np.uint8)
     right = np.roll(left, -disparity_px, axis=1)
@@ -26,7 +26,7 @@ def flat(rng, disparity_px, camera=None, height=60, width=90):
     return Renderer(StereoPair(left=left, right=right, camera=camera), estimate_of(map_px, map_px))
 
 
-def test_from_above_everything_lies_lower_by_its_disparity(rng):
+def test_from_above_every_pixel_moves_down_by_its_disparity(rng):
     renderer = flat(rng, 8)
     level, above = renderer.view(0.5), renderer.view(0.5, up=0.5)
     np.testing.assert_array_equal(above.image[4:], level.image[:-4])
@@ -34,7 +34,7 @@ def test_from_above_everything_lies_lower_by_its_disparity(rng):
     np.testing.assert_array_equal(above.drawn[4:], level.drawn[:-4])
 
 
-def test_from_below_what_is_near_covers_what_is_far(rng):
+def test_from_below_near_surfaces_cover_far_ones(rng):
     height, width = 40, 60
     left, right = np.full((2, height, width, 3), 50, np.uint8)
     maps = np.full((2, height, width), 2.0)
@@ -45,14 +45,14 @@ def test_from_below_what_is_near_covers_what_is_far(rng):
     expected = np.full((height, width), 50)
     expected[5:15, 25:35] = 200
     np.testing.assert_array_equal(view.image[..., 0], expected)
-    # The wall that was hidden below row 25 comes from the object's lower border, 8 rows.
+    # The 8 rows of wall that were hidden below row 25 continue from the object's lower border.
     invented = ~view.drawn
     assert invented[15:23, 26:34].all()
     assert not invented[5:15].any()
 
 
 def test_forward_everything_grows_about_the_centre_by_its_depth():
-    # At a depth of 80 / 8 = 10 baselines; one baseline nearer everything is 10 / 9 as large.
+    # The depth is 80 / 8 = 10 baselines; one baseline nearer, everything is 10 / 9 times as large.
     camera = StereoCamera(focal_px=80.0, baseline_m=0.1, cx_px=45.0, cy_px=30.0)
     columns, rows = np.meshgrid(np.arange(90), np.arange(60))
     left = np.stack([2 * columns, 3 * rows, columns + rows], axis=2).astype(np.uint8)
@@ -64,8 +64,8 @@ def test_forward_everything_grows_about_the_centre_by_its_depth():
     assert view.drawn.all()
 
 
-def test_backward_is_forward_undone_where_both_can_be_seen():
-    # From 10 baselines to 11, where the disparity is 80 / 11, and to 10 again.
+def test_moving_backward_undoes_moving_forward_where_both_views_are_valid():
+    # From 10 baselines to 11, where the disparity is 80 / 11, and back to 10.
     camera = StereoCamera(focal_px=80.0, baseline_m=0.1, cx_px=45.0, cy_px=30.0)
     columns, rows = np.meshgrid(np.arange(90), np.arange(60))
     left = np.stack([2 * columns, 3 * rows, columns + rows], axis=2).astype(np.uint8)
@@ -74,7 +74,7 @@ def test_backward_is_forward_undone_where_both_can_be_seen():
         estimate_of(*np.full((2, 60, 90), 8.0)),
     )
     far_left, far_right = (near.view(position, forward=-1.0) for position in (0.0, 1.0))
-    # 10 / 11 as large: 60 rows fill 54.5 of the picture.
+    # At 10 / 11 of the size, 60 rows fill 54.5 rows of the image.
     assert far_left.drawn[:, 45].sum() == pytest.approx(60 * 10 / 11, abs=1)
     far = Renderer(
         StereoPair(left=far_left.image, right=far_right.image, camera=camera),
@@ -88,11 +88,11 @@ def test_backward_is_forward_undone_where_both_can_be_seen():
 def test_an_offset_between_the_principal_points_counts_as_depth(rng):
     camera = StereoCamera(focal_px=80.0, baseline_m=0.1, cx_px=45.0, cy_px=30.0, doffs_px=4.0)
     level, above = (flat(np.random.default_rng(1), 8, camera).view(0.5, up=up) for up in (0.0, 0.5))
-    # Of depth 80 / (8 + 4) baselines: half a baseline moves it by 6 rows.
+    # The depth is 80 / (8 + 4) baselines: half a baseline moves the wall by 6 rows.
     np.testing.assert_array_equal(above.image[6:], level.image[:-6])
 
 
-def test_without_a_camera_the_focal_length_is_the_width_and_the_axis_meets_the_pictures_middle():
+def test_without_a_camera_the_focal_length_is_the_width_and_the_principal_point_central():
     camera = StereoCamera(focal_px=90.0, baseline_m=1.0, cx_px=44.5, cy_px=29.5)
     assumed, known = (flat(np.random.default_rng(1), 8, given) for given in (None, camera))
     view, expected = (renderer.view(0.5, up=0.25, forward=0.5) for renderer in (assumed, known))
@@ -100,16 +100,16 @@ def test_without_a_camera_the_focal_length_is_the_width_and_the_axis_meets_the_p
     np.testing.assert_array_equal(view.drawn, expected.drawn)
 
 
-def test_without_a_camera_the_farthest_of_a_converged_pair_is_taken_to_be_infinitely_far(rng):
+def test_without_a_camera_the_farthest_surface_of_a_converged_pair_is_infinitely_far(rng):
     renderer = flat(rng, -8)
     level, above = renderer.view(0.5), renderer.view(0.5, up=0.5)
     np.testing.assert_array_equal(above.image, level.image)
 
 
-def test_convergence_moves_a_view_from_above_and_before_aside_and_no_more(rng):
+def test_convergence_only_shifts_a_view_from_above_and_in_front_sideways(rng):
     straight = flat(rng, 8)
     converged = Renderer(straight.pair, straight.estimate, convergence_px=8.0)
-    # To the right by (0.25 - 0.5) * 8 px.
+    # The shift to the right is (0.25 - 0.5) * 8 px.
     view, expected = (renderer.view(0.25, up=0.5, forward=0.5) for renderer in (converged, straight))
     apart = np.abs(view.image[:, 4:80].astype(int) - expected.image[:, 6:82])
     assert apart.max() <= 1
@@ -117,13 +117,13 @@ def test_convergence_moves_a_view_from_above_and_before_aside_and_no_more(rng):
 
 @pytest.mark.parametrize(("name", "value"), [("up", 1.1), ("forward", -1.1), ("up", float("nan"))])
 def test_a_move_out_of_range_is_refused(rng, name, value):
-    with pytest.raises(ValueError, match=rf"^{name}: expected -1 to 1 \(baselines\), got {value}$"):
+    with pytest.raises(ValueError, match=rf"^{name}: expected -1 to 1 baselines, got {value}$"):
         flat(rng, 8).view(0.5, **{name: value})
 
 
 @pytest.mark.parametrize("rows", [slice(None), slice(None, None, -1)])
 def test_a_camera_moved_up_and_forward_keeps_the_order_of_depth(rows):
-    # Upside down, and from below, the near box comes after the other one where it came before.
+    # Upside down and seen from below, the near box is drawn after the other one instead of before it.
     camera = StereoCamera(focal_px=100.0, baseline_m=0.1, cx_px=45.0, cy_px=29.5)
     photos, maps = np.full((2, 60, 90, 3), 50, np.uint8), np.zeros((2, 60, 90))
     for side in (0, 1):
@@ -142,7 +142,7 @@ def test_a_camera_moved_up_and_forward_keeps_the_order_of_depth(rows):
 
 
 def random_move(rng, rate):
-    """A view of noise with slants and jumps, and for its pixels targets with folds, and disparities."""
+    """Return a view of noise with slants and jumps, and its pixels' disparities and targets, with folds."""
     height, width = 30, 50
     jumps = rng.choice([0.0, 8.0, -6.0, 12.0], (height, width), p=[0.85, 0.05, 0.05, 0.05])
     surface_px = np.cumsum(jumps + rng.normal(0, 0.8, (height, width)), axis=1).astype(np.float32)
@@ -162,7 +162,7 @@ def random_move(rng, rate):
 @pytest.mark.parametrize("halves", [False, True])
 def test_the_fast_move_equals_the_plain_one(rng, rate, halves):
     view, targets, disparity_px = random_move(rng, rate)
-    if halves:  # where a pixel's border falls on another's middle
+    if halves:  # pixel borders fall on the centres of other pixels
         targets = np.rint(2 * targets) / 2
     canvas = empty_canvas(255 - view.image)
     expected = plain_move(view, targets, disparity_px, canvas)

@@ -1,4 +1,4 @@
-"""Layouts by values worked out by hand, and by the views that they are made of."""
+"""Layouts match values computed by hand and the views that they consist of."""
 
 import io
 from pathlib import Path
@@ -52,27 +52,27 @@ def plain(*colour: int, height: int = 2, width: int = 2) -> np.ndarray:
 
 @pytest.fixture
 def wall(rng) -> Renderer:
-    """A wall 4 px apart in the two pictures of 48x33, with a pattern of 3 px."""
+    """Return a renderer of a wall at disparity 4 with a pattern of 3 px, in images of 48x33 px."""
     wide = np.asarray(
         Image.fromarray(rng.integers(0, 256, (11, 18, 3), dtype=np.uint8)).resize((54, 33), Image.BICUBIC)
     )
     return renderer_of(wide[:, :48].copy(), wide[:, 4:52].copy(), 4.0)
 
 
-def test_the_left_eye_is_on_the_left_on_the_right_where_eyes_cross_and_above():
+def test_the_left_eye_is_on_the_left_on_the_right_if_crossed_or_on_top():
     renderer = renderer_of(plain(1, 2, 3), plain(7, 8, 9))
     assert composed("side_by_side", renderer)[0].tolist() == [[1, 2, 3]] * 2 + [[7, 8, 9]] * 2
     assert composed("crossed", renderer)[0].tolist() == [[7, 8, 9]] * 2 + [[1, 2, 3]] * 2
     assert composed("top_bottom", renderer)[:, 0].tolist() == [[1, 2, 3]] * 2 + [[7, 8, 9]] * 2
 
 
-def test_halves_are_means_of_two_columns_and_the_last_of_an_odd_width_is_kept():
+def test_half_width_averages_two_columns_and_keeps_the_last_of_an_odd_width():
     row = np.repeat(np.array([[10, 20, 30, 50, 90]], np.uint8)[..., None], 3, axis=2)
     picture = composed("side_by_side_half", renderer_of(row, row + 100))
     assert picture[..., 1].tolist() == [[15, 40, 90, 115, 140, 190]]
 
 
-def test_halves_are_means_of_two_rows_and_the_last_of_an_odd_height_is_kept():
+def test_half_height_averages_two_rows_and_keeps_the_last_of_an_odd_height():
     column = np.repeat(np.array([[10], [20], [60]], np.uint8)[..., None], 3, axis=2)
     picture = composed("top_bottom_half", renderer_of(column, column + 100))
     assert picture[..., 1].tolist() == [[15], [60], [115], [160]]
@@ -89,25 +89,25 @@ def test_halves_are_means_of_two_rows_and_the_last_of_an_odd_height_is_kept():
         ("anaglyph_dubois", [93, 93, 78]),
     ],
 )
-def test_red_is_of_the_left_eye_and_cyan_of_the_right_one(name, expected):
+def test_red_shows_the_left_eye_s_view_and_cyan_the_right_one_s(name, expected):
     picture = composed(name, renderer_of(plain(100, 50, 200), plain(40, 120, 80)))
     assert picture[0, 0].tolist() == expected
 
 
 @pytest.mark.parametrize("name", ANAGLYPHS)
 @pytest.mark.parametrize("level", [0, 100, 255])
-def test_a_grey_that_both_eyes_see_stays_what_it_is(name, level):
+def test_a_grey_that_both_eyes_see_is_unchanged(name, level):
     grey = plain(level, level, level)
     np.testing.assert_array_equal(composed(name, renderer_of(grey, grey)), grey)
 
 
-def test_what_an_anaglyph_cannot_show_is_cut_off():
-    # Dubois's green of this pair is -0.04 * 255, his red 0.456 * 255.
+def test_colours_that_an_anaglyph_cannot_show_are_clipped():
+    # With Dubois's matrices, this pair's green is -0.04 * 255 and its red 0.456 * 255.
     picture = composed("anaglyph_dubois", renderer_of(plain(255, 0, 0), plain(0, 0, 0)))
     assert picture[0, 0].tolist() == [116, 0, 0]
 
 
-def test_depth_is_white_where_it_is_near_and_cut_off_beyond_its_range():
+def test_near_disparity_is_white_and_clipped_beyond_the_range():
     left = plain(1, 2, 3, height=1, width=4)
     pair = StereoPair(left=left, right=plain(7, 8, 9, height=1, width=4))
     renderer = Renderer(pair, estimate_of(np.array([[-3.0, 2.0, 10.0, 20.0]])), threads=1)
@@ -116,7 +116,7 @@ def test_depth_is_white_where_it_is_near_and_cut_off_beyond_its_range():
     assert picture[0, 4:].tolist() == [[0] * 3, [51] * 3, [255] * 3, [255] * 3]
 
 
-def test_depth_takes_the_range_of_its_own_disparities_unless_it_is_given_one(rng):
+def test_rgbd_uses_the_range_of_its_own_disparities_unless_given_one(rng):
     disparity_px = np.linspace(5.0, 25.0, 1000).reshape(20, 50)
     pair = StereoPair(left=plain(1, 2, 3, height=20, width=50), right=plain(7, 8, 9, height=20, width=50))
     depth = composed("rgbd", Renderer(pair, estimate_of(disparity_px), threads=1))[:, 50:]
@@ -124,24 +124,24 @@ def test_depth_takes_the_range_of_its_own_disparities_unless_it_is_given_one(rng
     assert depth[10, 0, 0] == 128
 
 
-def test_a_quilt_begins_at_the_bottom_left_and_ends_at_the_top_right(wall):
+def test_a_quilt_runs_from_the_bottom_left_to_the_top_right(wall):
     picture = composed("quilt", wall, columns=3, rows=2)
-    # Six views from -0.5 to 1.5 are 0.4 apart.
+    # Six views, from -0.5 to 1.5, are 0.4 apart.
     expected = [(0.7, 1.1, 1.5), (-0.5, -0.1, 0.3)]
     rows = [np.hstack([wall.view(position).image for position in row]) for row in expected]
     np.testing.assert_array_equal(picture, np.vstack(rows))
 
 
-def test_in_a_quilt_the_wall_goes_to_the_left_as_the_camera_goes_to_the_right(wall):
+def test_in_a_quilt_the_wall_moves_left_as_the_camera_moves_right(wall):
     tiles = np.split(composed("quilt", wall, columns=3, rows=1), 3, axis=1)
     # The three cameras are one baseline apart, and so 4 px.
     np.testing.assert_allclose(tiles[0][:, 8:40].astype(int), tiles[1][:, 4:36].astype(int), atol=24)
     np.testing.assert_allclose(tiles[1][:, 8:40].astype(int), tiles[2][:, 4:36].astype(int), atol=24)
 
 
-def test_a_quilt_is_made_smaller_where_it_would_go_beyond_8192_px():
+def test_a_quilt_is_scaled_down_to_at_most_8192_px():
     renderer = renderer_of(*np.zeros((2, 20, 200, 3), np.uint8))
-    # 50 * 200 px are 1.2207 times 8192 px: views of 163x16 px.
+    # 50 * 200 px are 1.2207 times 8192 px, so views have 163x16 px.
     assert composed("quilt", renderer, columns=50, rows=4).shape == (4 * 16, 50 * 163, 3)
 
 
@@ -151,7 +151,7 @@ def test_a_quilt_has_2_to_200_views(columns, rows):
         LayoutOptions(columns=columns, rows=rows)
 
 
-def test_a_contact_sheet_is_read_from_the_left_camera_s_side_to_the_right_one_s(wall):
+def test_a_contact_sheet_runs_from_the_left_camera_to_the_right_one(wall):
     sheet = composed("contact_sheet", wall)
     assert sheet.shape == (33, 48, 3)
     left, middle, right = (
@@ -164,7 +164,7 @@ def test_a_contact_sheet_is_read_from_the_left_camera_s_side_to_the_right_one_s(
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_every_layout_takes_odd_sizes_and_leaves_the_pair_as_it_was(name, rng):
+def test_every_layout_accepts_odd_sizes_and_leaves_the_pair_unchanged(name, rng):
     left, right = rng.integers(0, 256, (2, 33, 45, 3), dtype=np.uint8)
     before = left.copy(), right.copy()
     picture = composed(name, renderer_of(left, right, 2.0))
@@ -173,7 +173,7 @@ def test_every_layout_takes_odd_sizes_and_leaves_the_pair_as_it_was(name, rng):
     np.testing.assert_array_equal((left, right), before)
 
 
-def test_a_motion_goes_there_and_back_without_a_stop_where_it_begins_anew():
+def test_an_animation_moves_back_and_forth_without_a_repeated_frame():
     for motion in ANIMATIONS.values():
         positions = np.array(motion.positions)
         assert positions[0] == 0
@@ -183,17 +183,17 @@ def test_a_motion_goes_there_and_back_without_a_stop_where_it_begins_anew():
         assert motion.frame_ms % 10 == 0
 
 
-def test_a_wiggle_is_seen_from_both_cameras():
+def test_a_wiggle_reaches_both_cameras():
     assert {0.0, 1.0} <= set(ANIMATIONS["wiggle"].positions)
 
 
-def test_an_mp4_wiggles_for_a_few_seconds_and_what_repeats_itself_once():
+def test_an_mp4_repeats_the_wiggle_and_looping_formats_do_not():
     wiggle = ANIMATIONS["wiggle"]
     assert (wiggle.turns("a.gif"), wiggle.turns("a.webp")) == (1, 1)
     assert 3000 < wiggle.turns("a.MP4") * len(wiggle.positions) * wiggle.frame_ms < 5000
 
 
-def test_frames_are_rendered_when_they_are_asked_for(wall):
+def test_frames_are_rendered_on_demand(wall):
     coming = render_views(wall, [1.0, 7.0])
     np.testing.assert_array_equal(next(coming), wall.pair.right)
     with pytest.raises(StereoweaveError, match="position"):
@@ -218,12 +218,12 @@ def test_frames_are_rendered_when_they_are_asked_for(wall):
         ("contact_sheet", "view.png", "view.png"),
     ],
 )
-def test_a_file_has_the_mark_that_its_viewers_look_for(name, given, expected):
+def test_a_file_name_has_the_suffix_that_viewers_look_for(name, given, expected):
     picture = plain(0, 0, 0, height=8, width=6)
     assert add_mark(given, name, StereoPair(left=picture, right=picture), LayoutOptions()) == Path(expected)
 
 
-def test_the_mark_of_a_quilt_says_what_it_has():
+def test_the_suffix_of_a_quilt_gives_its_grid_and_aspect_ratio():
     picture = plain(0, 0, 0, height=9, width=16)
     pair = StereoPair(left=picture, right=picture)
     assert add_mark("view.png", "quilt", pair, LayoutOptions(columns=5, rows=9)) == Path(
@@ -242,7 +242,7 @@ def test_the_mark_of_a_quilt_says_what_it_has():
         ("view.webp", "wiggle", "wiggle"),
     ],
 )
-def test_a_layout_is_known_by_its_name_or_by_the_ending_of_the_file(path, name, expected):
+def test_a_layout_is_chosen_by_name_or_by_the_file_s_ending(path, name, expected):
     assert choose_layout(path, name) == expected
 
 
@@ -257,7 +257,7 @@ def test_a_layout_is_known_by_its_name_or_by_the_ending_of_the_file(path, name, 
         ("view.mp4", None, r"view\.mp4: expected a picture file ending \(\.png"),
     ],
 )
-def test_an_unknown_layout_or_an_ending_that_does_not_fit_it_is_told(path, name, expected):
+def test_an_unknown_layout_or_one_that_does_not_fit_the_ending_is_refused(path, name, expected):
     with pytest.raises(StereoweaveError, match=expected):
         choose_layout(path, name)
 
@@ -266,7 +266,7 @@ def test_an_unknown_layout_or_an_ending_that_does_not_fit_it_is_told(path, name,
     ("positions", "strength"),
     [((-1.0, 2.0), 1.0), ((0.0, 1.0), 3.0), ((-0.5, 1.5), 1.5), ((2.5,), 0.5), ((), 100.0)],
 )
-def test_what_a_renderer_reaches_is_accepted(positions, strength):
+def test_positions_that_can_be_rendered_are_accepted(positions, strength):
     check_positions(positions, strength)
 
 
@@ -280,12 +280,12 @@ def test_what_a_renderer_reaches_is_accepted(positions, strength):
         ((0.5,), float("nan"), "got nan"),
     ],
 )
-def test_what_no_renderer_reaches_is_told(positions, strength, found):
+def test_positions_that_cannot_be_rendered_are_refused(positions, strength, found):
     with pytest.raises(StereoweaveError, match=f"expected -1 to 2 .*, {found}"):
         check_positions(positions, strength)
 
 
-def test_the_middle_of_a_scene_is_where_half_of_the_confidence_is_nearer():
+def test_the_median_disparity_is_weighted_by_confidence():
     disparity_px, confidence = np.array([[1.0, 100, 6, 7, 5]]), np.array([[1.0, 0.1, 0.1, 0.1, 1]])
     # In order 1, 5, 6, 7, 100 px: half of the sum, 1.15, is reached at 5 px.
     assert median_disparity_px(estimate_of(disparity_px, confidence)) == 5
@@ -298,11 +298,13 @@ def test_an_mpo_file_holds_two_pictures_the_left_eye_s_first(tmp_path, wall):
         assert (file.format, file.n_frames) == ("MPO", 2)
         for index, eye in enumerate((wall.pair.left, wall.pair.right)):
             file.seek(index)
-            assert np.abs(np.asarray(file.convert("RGB")).astype(int) - eye).mean() < 4  # the other eye's: 50
+            assert (
+                np.abs(np.asarray(file.convert("RGB")).astype(int) - eye).mean() < 4
+            )  # the other eye's view differs by 50
     assert [file.name for file in tmp_path.iterdir()] == ["view.mpo"]
 
 
-def test_a_jps_file_is_a_jpeg_that_says_which_eye_is_where(tmp_path, wall):
+def test_a_jps_file_is_a_jpeg_whose_header_gives_the_layout(tmp_path, wall):
     picture = composed("crossed", wall)
     write_picture(tmp_path / "view.jps", picture)
     with Image.open(io.BytesIO((tmp_path / "view.jps").read_bytes())) as file:
@@ -314,7 +316,7 @@ def test_a_jps_file_is_a_jpeg_that_says_which_eye_is_where(tmp_path, wall):
     assert list(segments["APP3"][10:14]) == [0, 0, 2, 1]
 
 
-def test_other_endings_are_pictures_as_any(tmp_path, wall):
+def test_other_endings_are_ordinary_pictures(tmp_path, wall):
     picture = composed("quilt", wall)
     write_picture(tmp_path / "view.png", picture)
     np.testing.assert_array_equal(read_image(tmp_path / "view.png"), picture)

@@ -25,13 +25,13 @@ def make_estimate(disparity_px, right_disparity_px, confidence=None):
         disparity_px=disparity_px.astype(np.float32),
         right_disparity_px=right_disparity_px.astype(np.float32),
         confidence=confidence.astype(np.float32),
-        # Where nothing is seen by both, the photographs are not brought to one look: tests look at levels.
+        # If no pixel is seen by both cameras, the exposures are not matched; tests check exact levels.
         occluded=np.ones(disparity_px.shape, bool),
     )
 
 
 def wall_with_object(object_columns, height=5, width=40):
-    """Photographs of a plain wall at disparity 2, and an object at 10 in these columns of the left one."""
+    """Return a pair and its estimate: a plain wall at disparity 2, an object at 10 in these left columns."""
     photos, maps = [], []
     for shift in (0, -10):
         photo = np.tile(BACKGROUND, (height, width, 1))
@@ -45,7 +45,7 @@ def wall_with_object(object_columns, height=5, width=40):
 
 
 def random_scene(rng, *, lowest_px=0.0, height=14, width=40):
-    """Photographs of noise, and maps that agree in places only: slants, edges, sticks, and plain errors."""
+    """Return a pair of noise and an estimate whose maps partly agree: slants, edges, sticks and errors."""
     columns = np.arange(width)
     maps = []
     for sign in (1, -1):
@@ -62,9 +62,9 @@ def random_scene(rng, *, lowest_px=0.0, height=14, width=40):
     return left, right, make_estimate(*maps, confidence=rng.random((height, width)))
 
 
-def test_halfway_between_the_cameras_a_wall_has_moved_by_half_its_disparity(rng):
+def test_halfway_between_the_cameras_a_wall_moves_by_half_its_disparity(rng):
     wide = rng.integers(0, 256, (8, 46, 3), dtype=np.uint8)
-    left, right = wide[:, :40], wide[:, 6:]  # what is at x in the left image is at x - 6 in the right one
+    left, right = wide[:, :40], wide[:, 6:]  # column x of the left image is at x - 6 in the right one
     view = render(left, right, make_estimate(*np.full((2, 8, 40), 6.0)), 0.5)
     np.testing.assert_array_equal(view.image, wide[:, 3:43])
     assert view.drawn.all()
@@ -72,7 +72,7 @@ def test_halfway_between_the_cameras_a_wall_has_moved_by_half_its_disparity(rng)
 
 @pytest.mark.parametrize("position", [0.25, 0.75, 1.25, -0.25])
 def test_a_slanted_ramp_of_grey_is_where_its_disparity_says(position):
-    # d = 4 + x / 8: what is at x in the left image is at u = x - position (4 + x / 8); its grey level is 3 x.
+    # d = 4 + x / 8: column x of the left image, of grey level 3 x, is at u = x - position (4 + x / 8).
     columns = np.arange(64.0)
     to_left_column = lambda u, at: (u + 4 * at) / (1 - at / 8)  # noqa: E731
     photos = [np.clip(np.rint(3 * to_left_column(columns, at)), 0, 255).astype(np.uint8) for at in (0, 1)]
@@ -86,7 +86,7 @@ def test_a_slanted_ramp_of_grey_is_where_its_disparity_says(position):
 
 
 @pytest.mark.parametrize("position", [0, 1])
-def test_at_the_cameras_the_view_is_the_photograph_itself(rng, position):
+def test_at_a_camera_the_view_is_its_image(rng, position):
     left, right, estimate = random_scene(rng)
     view = render(left, right, estimate, position)
     np.testing.assert_array_equal(view.image, (left, right)[position])
@@ -94,11 +94,11 @@ def test_at_the_cameras_the_view_is_the_photograph_itself(rng, position):
 
 
 @pytest.mark.parametrize(("camera", "position"), [(0, 1e-3), (0, -1e-3), (1, 1 - 1e-3), (1, 1 + 1e-3)])
-def test_beside_a_camera_the_view_is_nearly_its_photograph(rng, camera, position):
+def test_next_to_a_camera_the_view_is_nearly_its_image(rng, camera, position):
     left, right, estimate = random_scene(rng)
     view = render(left, right, estimate, position)
     apart = np.abs(view.image.astype(int) - (left, right)[camera])
-    # 15 px of disparity move by 0.015 px; and the other photograph weighs a thousandth.
+    # A disparity of 15 px moves by 0.015 px, and the other image has a weight of a thousandth.
     assert np.median(apart) <= 1
     assert view.drawn.mean() > 0.99
 
@@ -112,32 +112,32 @@ def test_an_object_lands_where_its_disparity_says_and_hides_the_wall():
     np.testing.assert_array_equal(view.image[:, 21:], np.broadcast_to(BACKGROUND, (5, 19, 3)))
 
 
-def test_beyond_the_left_camera_the_right_one_shows_what_the_left_one_missed():
+def test_beyond_the_left_camera_the_right_image_shows_what_the_left_one_lacks():
     left, right, estimate = wall_with_object(slice(20, 26))
     view = render(left, right, estimate, -0.5)
-    # The object is at 25..30. The left camera sees the wall up to 19, which is 20 here; the right one sees it
-    # from 16 on, which is 19 here, up to the object: no hole.
+    # The object is at 25..30. The left camera sees the wall up to column 19, which is 20 in the view; the
+    # right camera sees it from 16 on, which is 19 in the view, up to the object. So there is no hole.
     np.testing.assert_array_equal(view.image[:, 25:31], np.broadcast_to(OBJECT, (5, 6, 3)))
     np.testing.assert_array_equal(view.image[:, 31:], np.broadcast_to(BACKGROUND, (5, 9, 3)))
     assert view.drawn[:, 1:].all()
-    # The left photograph's first column is at 1, the right one's at 3.
+    # The first column of the left image is at 1, that of the right image at 3.
     assert not view.drawn[:, 0].any()
 
 
-def test_a_hole_is_exactly_where_both_cameras_sight_is_blocked():
-    # The object is at 25..40. The left camera sees the wall up to 19, which is 20 here; the right one up to
-    # 9, and from 26 on, which is 29 here and behind the object.
+def test_holes_are_exactly_the_pixels_that_neither_camera_sees():
+    # The object is at 25..40. The left camera sees the wall up to column 19, which is 20 in the view; the
+    # right camera sees it up to 9, and from 26 on, which is 29 in the view and behind the object.
     left, right, estimate = wall_with_object(slice(20, 36))
     shade = np.arange(40, dtype=np.uint8)[None, :, None]
     left = np.where(left == BACKGROUND, left + shade, left)
     right = np.where(right == BACKGROUND, right + shade + 2, right)
     view = render(left, right, estimate, -0.5)
     hole = np.zeros(40, bool)
-    hole[0] = True  # left of the left photograph
-    hole[20:25] = True  # 20 as well: the left camera saw it at the object's rim, where colours mix
+    hole[0] = True  # left of the left image
+    hole[20:25] = True  # includes 20, which the left camera saw at the object's rim, where colours mix
     np.testing.assert_array_equal(~view.drawn, np.tile(hole, (5, 1)))
     np.testing.assert_array_equal(view.image[:, 25:40], np.broadcast_to(OBJECT, (5, 15, 3)))
-    # The wall goes on with its own shades, not with the object's colour.
+    # The wall continues in its own shades, not in the object's colour.
     shades = view.image[:, 20:25].astype(int) - BACKGROUND
     np.testing.assert_array_equal(shades, np.broadcast_to(shades[..., :1], shades.shape))
     assert set(shades.ravel()) <= set(range(2, 19))
@@ -151,14 +151,15 @@ def test_a_seam_of_mixed_colours_around_an_object_stays_with_the_object():
     view = render(left, right, estimate, 0.5)
     wall = np.r_[0:14, 22:40]
     apart = np.abs(view.image[:, wall].astype(int) - BACKGROUND)
-    # Each photograph's seam falls on wall that the other one shows clean, and weighs a tenth: 9 % of 105.
+    # Each image's seam falls on wall that the other image shows clean, and has a tenth of the weight: 9 % of
+    # 105.
     assert apart.max() <= 10
 
 
 @pytest.mark.parametrize(("confidence", "level"), [(0.05, 156), (0.95, 167)])
 def test_confidence_decides_between_maps_that_contradict_each_other(confidence, level):
-    # The left map has an object, at 24..29 of the new view, that the right one looks through; the photographs
-    # differ by as much everywhere. The left camera alone sees it, half of the weight; both see the wall.
+    # The left map has an object at 24..29 of the new view, which the right map contradicts; the images differ
+    # equally everywhere. Only the left camera sees the object, which halves its weight; both see the wall.
     left, right = np.full((9, 60, 3), 200, np.uint8), np.full((9, 60, 3), 100, np.uint8)
     disparity_px = np.full((9, 60), 2.0)
     disparity_px[:, 30:36] = 12
@@ -169,9 +170,9 @@ def test_confidence_decides_between_maps_that_contradict_each_other(confidence, 
     assert (view.image[:, 24:28] == level).all()
 
 
-def test_a_thin_thing_that_both_maps_have_lost_is_not_seen_doubled():
-    # A stick before a wall of shades, at 20 in the left photograph and at 12 in the right one; the maps have
-    # the wall alone, at 2, before which the stick would show at 19 and at 13 of the view half-way.
+def test_a_thin_object_that_both_maps_missed_is_not_doubled():
+    # A stick before a shaded wall, at 20 in the left image and at 12 in the right one. The maps have only the
+    # wall, at 2, so the halfway view would show the stick twice, at 19 and at 13.
     wall = np.repeat((100 + np.arange(40) // 4)[None, :, None], 9, axis=0).repeat(3, axis=2).astype(np.uint8)
     left, right = wall.copy(), np.roll(wall, -2, axis=1)
     left[:, 20], right[:, 12] = OBJECT, OBJECT
@@ -181,14 +182,14 @@ def test_a_thin_thing_that_both_maps_have_lost_is_not_seen_doubled():
     assert np.abs(view.image.astype(int) - expected)[:, 3:-3].max() <= 2
 
 
-def test_a_row_that_nothing_lands_on_shows_the_nearest_photograph_as_invented():
+def test_a_row_that_nothing_lands_on_shows_the_nearest_image_marked_as_filled():
     left, right = np.full((2, 6, 32, 3), 50, np.uint8)
     view = render(left + 10, right, make_estimate(*np.full((2, 6, 32), 500.0)), 0.4)
     assert (view.image == 60).all()
     assert not view.drawn.any()
 
 
-def test_neither_the_photographs_nor_the_estimate_are_changed_and_they_may_be_read_only(rng):
+def test_images_and_estimate_may_be_read_only_and_are_not_changed(rng):
     left, right, estimate = random_scene(rng)
     before = left.copy(), estimate.disparity_px.copy()
     expected = render(left, right, estimate, 0.3)
@@ -218,7 +219,7 @@ def test_sizes_that_differ_are_refused_in_one_line(rng):
 @pytest.mark.parametrize("convergence_px", [0, 2, 10])
 @pytest.mark.parametrize("position", [0.0, 0.5, 1.0])
 def test_convergence_keeps_its_plane_in_place(convergence_px, position):
-    # The object, of disparity 10, is at 20 in the left photograph and at 10 in the right one.
+    # The object, of disparity 10, is at 20 in the left image and at 10 in the right one.
     left, right, estimate = wall_with_object(slice(20, 26))
     renderer = Renderer(StereoPair(left=left, right=right), estimate, convergence_px=convergence_px)
     first = {0: 20 - 10 * position, 10: 15, 2: 20 - 10 * position + 2 * (position - 0.5)}[convergence_px]
@@ -288,14 +289,14 @@ print(sum(kernels.splat.stats.cache_hits.values()))
 
 @pytest.fixture
 def installation(tmp_path):
-    """A copy of the package, where an installation might be."""
+    """Copy the package to where an installation might be. Returns the folder."""
     folder = tmp_path / "site-packages"
     package = Path(stereoweave.__file__).parent
     shutil.copytree(package, folder / "stereoweave", ignore=shutil.ignore_patterns("weights", "__pycache__"))
     return folder
 
 
-def test_compiled_kernels_are_kept_in_the_users_folder_and_loaded_from_there(installation, tmp_path):
+def test_compiled_kernels_are_stored_in_the_user_s_folder_and_loaded_from_it(installation, tmp_path):
     code = SPLAT.format(folder=str(installation))
     before = sorted(installation.rglob("*"))
     assert in_new_process(code, tmp_path) == "0\n"
@@ -313,7 +314,7 @@ def test_numbas_own_variable_moves_the_kernels(installation, tmp_path):
 
 
 def test_without_any_writable_folder_the_kernels_still_work(installation, tmp_path):
-    # Folders cannot be made below files, whoever tries: this holds for the superuser too.
+    # Nobody, not even the superuser, can make a folder below a file.
     (tmp_path / "cache").write_text("")
     (installation / "stereoweave" / "__pycache__").write_text("")
     code = SPLAT.format(folder=str(installation))
@@ -327,7 +328,7 @@ def test_without_a_home_folder_the_kernels_still_work(installation, tmp_path):
 
 @pytest.mark.parametrize("position", [0.5, 1.5])
 def test_the_view_does_not_depend_on_the_number_of_threads(rng, position):
-    # Beyond the cameras, what is hidden is found in bands of 60 rows.
+    # For views from beyond the cameras, hidden background is found in bands of 60 rows.
     scene = random_scene(rng, height=130)
     one, three = (render(*scene, position, threads=threads) for threads in (1, 3))
     np.testing.assert_array_equal(three.image, one.image)
@@ -342,7 +343,7 @@ def test_importing_the_package_or_the_renderer_does_not_import_numba():
     )
 
 
-def test_photographs_of_different_exposure_make_one_look_on_the_way_from_one_to_the_other(rng):
+def test_between_images_of_different_exposure_the_look_changes_gradually(rng):
     coarse = rng.integers(20, 200, (12, 16, 3)).astype(np.uint8)
     left = np.repeat(np.repeat(coarse, 8, axis=0), 8, axis=1)
     brighter = np.rint(left * 1.2).astype(np.uint8)
@@ -362,14 +363,14 @@ def test_a_convergence_beyond_the_pictures_width_is_refused(rng, convergence_px)
 
 
 @pytest.mark.parametrize("strength", [float("nan"), float("inf"), -1.0])
-def test_a_strength_that_is_none_is_refused(rng, strength):
+def test_an_invalid_strength_is_refused(rng, strength):
     left, right, estimate = random_scene(rng)
     with pytest.raises(ValueError, match=r"^strength: expected 0 or more, got "):
         Renderer(StereoPair(left=left, right=right), estimate, strength=strength)
 
 
-def test_a_view_from_above_moves_what_has_negative_disparity_too():
-    # Of the two, the wall at -8 is taken to be far away; the stripe at -3 is 5 px nearer.
+def test_a_view_from_above_also_moves_surfaces_of_negative_disparity():
+    # The wall at -8 px is taken to be infinitely far; the stripe at -3 px is 5 px nearer.
     left = np.zeros((20, 30, 3), np.uint8)
     left[8:12] = 200
     disparity_px = np.full((20, 30), -8.0)

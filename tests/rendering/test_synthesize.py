@@ -23,7 +23,7 @@ def test_synthesizing_is_estimating_and_then_rendering(pair):
     np.testing.assert_array_equal(view.drawn, expected.drawn)
 
 
-def test_the_model_is_the_callers_choice(pair):
+def test_the_caller_chooses_the_model(pair):
     with pytest.raises(MatcherError, match="no_such_model"):
         synthesize(*pair, 0.5, model="no_such_model")
 
@@ -34,7 +34,7 @@ def test_a_position_out_of_range_is_refused_before_a_model_is_loaded(pair):
 
 
 @pytest.mark.testdata
-def test_a_real_photograph_from_between_is_met_better_than_by_fading(testdata):
+def test_a_view_is_closer_to_a_real_picture_from_between_than_a_blend(testdata):
     scene = testdata / "stereo/views/tsukuba"
     left, right, truth = (read_image(scene / f"{name}.png") for name in ("left", "right", "view_0.5"))
     faded = np.round((left.astype(float) + right) / 2).astype(np.uint8)
