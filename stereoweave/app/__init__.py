@@ -1,1 +1,1 @@
-"""The page in a browser, and depth of a live camera."""
+"""The web page, and depth from a live camera."""

@@ -1,4 +1,4 @@
-"""Access control of the page: only the routes that it needs, and only the visitor's own files."""
+"""Access control of the page: only the routes it needs, and only each visitor's own files."""
 
 import json
 import re
@@ -14,7 +14,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 # A browser may load nothing from other servers, whatever the page requests.
 _POLICY = "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:"
-_REFUSED = "expected a file that you gave to this page or that it made of yours; give it again"
+_REFUSED = "expected a file that you uploaded or that this page made for you; upload the pictures again"
 _COOKIE = "stereoweave-visitor"
 _VISITOR = re.compile(r"[\w-]{43}", re.ASCII)
 _API = "/gradio_api"
@@ -29,13 +29,13 @@ _ROUTES = re.compile(
 # Routes whose responses name files to the visitor.
 _NAMING = (f"{_API}/upload", f"{_API}/queue/data")
 _MOST_BODY_BYTES = 1_000_000
-# About 200 bytes each; a visitor who studies a pair for an hour receives hundreds.
+# A path takes about 200 bytes; a visitor who studies a pair for an hour receives hundreds of paths.
 _MOST_NAMED = 10_000
 _MOST_VISITORS = 1_000
 
 
 class ContentPolicy:
-    """Middleware that forbids browsers to load anything from other servers."""
+    """Middleware that keeps browsers from loading anything from other servers."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
@@ -45,11 +45,11 @@ class ContentPolicy:
 
 
 class OwnFiles:
-    """Middleware that restricts visitors to files that the page has named to them: uploads, results, sample.
+    """Middleware that restricts visitors to the files that the page has named to them.
 
-    A requested path is compared as text with the paths in earlier responses to the same cookie, so a foreign
-    path is never looked up on disk. Gradio checks paths only in servers that it starts itself, and not by
-    visitor.
+    These are uploads, results and the sample. A requested path is compared as text with the paths in earlier
+    responses to the same cookie, so a foreign path is never looked up on disk. Gradio checks paths only in
+    servers that it starts itself, and not per visitor.
     """
 
     def __init__(self, app: ASGIApp) -> None:
@@ -74,7 +74,12 @@ class OwnFiles:
         await self._app(_remove_cookies(scope), receive, send)
 
     async def _checked(self, scope: Scope, receive: Receive, visitor: str) -> Receive:
-        """The channel to read the request from; raises PermissionError if it names a file of someone else."""
+        """Return the channel from which to read a request.
+
+        Raises:
+            PermissionError: If the route is closed, the request is invalid, or it names another visitor's
+                file.
+        """
         path, method = scope["path"], scope.get("method")
         if scope["type"] != "http" or not _ROUTES.fullmatch(path):
             raise PermissionError
@@ -91,7 +96,10 @@ class OwnFiles:
             raise PermissionError
 
     def _watch_response(self, send: Send, visitor: str) -> Send:
-        """Remember the files that a response names: a list of uploads, or one event a line."""
+        """Return a `send` that remembers the files that a response names.
+
+        The response is a list of uploads, or has one event per line.
+        """
         kept = b""
 
         async def send_and_remember(message: Message) -> None:
@@ -117,7 +125,7 @@ class OwnFiles:
 
 
 class _Named:
-    """The paths named to each visitor, limited per visitor, so that none displaces another's."""
+    """Paths named to each visitor, limited per visitor, so that no visitor displaces another's paths."""
 
     def __init__(self) -> None:
         self._visitors: OrderedDict[str, OrderedDict[str, None]] = OrderedDict()
@@ -136,15 +144,15 @@ class _Named:
 
 
 def _use(entries: OrderedDict[str, Any], key: str, most: int) -> None:
-    """Move an entry to the end, and remove the first if there are more than `most`."""
+    """Move an entry to the end, and remove the first entry if there are more than `most`."""
     entries.move_to_end(key)
     if len(entries) > most:
         entries.popitem(last=False)
 
 
 def _find_visitor(scope: Scope) -> str:
-    """The visitor's cookie; empty if there is none."""
-    # In some versions of Python the time to unquote a cookie grows with the square of its length.
+    """Return the visitor's cookie; an empty string if there is none."""
+    # Parsed by hand: in some versions of Python, the time to unquote a cookie is quadratic in its length.
     for header in Headers(scope=scope).getlist("cookie"):
         for cookie in header.split(";"):
             name, _, value = (part.strip() for part in cookie.partition("="))
@@ -154,7 +162,7 @@ def _find_visitor(scope: Scope) -> str:
 
 
 def _remove_cookies(scope: Scope) -> Scope:
-    """The request without cookies: Gradio would unquote those of other servers too."""
+    """Return the request without cookies, because Gradio would unquote even the cookies of other servers."""
     return {**scope, "headers": [(name, value) for name, value in scope["headers"] if name != b"cookie"]}
 
 
@@ -168,7 +176,9 @@ def _add_header(send: Send, name: str, value: str) -> Send:
 
 
 async def _read_json(request: Request) -> tuple[Any, bytes]:
-    """The value of a request's JSON body, and the body encoded again, so that Gradio reads what is checked.
+    """Return the value of a request's JSON body, and the value encoded again as a body for Gradio.
+
+    So Gradio reads exactly what was checked.
 
     Raises:
         PermissionError: If the body is not JSON, or too large.
@@ -186,7 +196,7 @@ async def _read_json(request: Request) -> tuple[Any, bytes]:
 
 
 def _find_paths(value: Any) -> Iterator[Any]:
-    """Yield every `path` in a value: Gradio treats any mapping with this key as a file."""
+    """Yield every value of a key `path` within a value: Gradio treats any mapping with this key as a file."""
     waiting = [value]
     while waiting:
         match waiting.pop():
@@ -199,7 +209,7 @@ def _find_paths(value: Any) -> Iterator[Any]:
 
 
 def _replay(body: bytes, receive: Receive) -> Receive:
-    """A channel that gives a body that was read already, then the messages after it."""
+    """Return a channel that delivers a body that was already read, and then the messages after it."""
     messages = [{"type": "http.request", "body": body, "more_body": False}]
 
     async def receive_again() -> Message:

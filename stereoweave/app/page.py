@@ -1,4 +1,4 @@
-"""The web page, in Gradio: depth of an uploaded pair, a slider of views, point cloud, distances, files."""
+"""The Gradio web page: depth of an uploaded pair, a slider through views, point cloud, distances, files."""
 
 import html
 import importlib.resources
@@ -34,8 +34,8 @@ from stereoweave.pictures.loading import FORMATS
 from stereoweave.pictures.prepare import Request
 
 _LIFETIME_S = 3600
-# Each keeps its last result: 60 MB and 19 bytes per pixel of the left picture (0.5 GB at 24 megapixels) in
-# memory, and its files (0.9 GB at 24 megapixels) on disk.
+# Each session keeps its last result: in memory 60 MB and 19 bytes per pixel of the left picture (0.5 GB at 24
+# megapixels), and on disk its files (0.9 GB at 24 megapixels).
 _MOST_SESSIONS = 4
 _DETECTED = "detected"
 _MODELS = [("fast", "small"), ("fine", "base")]
@@ -59,7 +59,7 @@ side by side, one above the other, MPO or JPS.</li>
 <li>Press <b>Find depth</b>. Pictures straight from two cameras must be rectified first: tick the box.</li>
 <li>Move between the cameras, rotate the point cloud, measure, and download the files.</li>
 </ol></div>"""
-_TO_MEASURE = "Click two points of the left picture: their depths and their distance appear here."
+_TO_MEASURE = "Click two points in the left picture to see their depths and the distance between them here."
 _WITHOUT_WEBGL = """const canvas = document.createElement("canvas");
 if (!canvas.getContext("webgl2") && !canvas.getContext("webgl")) element.innerHTML =
   '<p class="notice problem">This browser cannot draw in 3-D: turn on its hardware acceleration ' +
@@ -73,7 +73,7 @@ def label_of(setting: str) -> str | None:
 
 
 class Page:
-    """The page's components and their event handlers; `folder` keeps files to download for an hour."""
+    """The page's components and event handlers; files to download are kept in `folder` for an hour."""
 
     def __init__(self, folder: Path, provider: str = CPU) -> None:
         self._folder, self._provider = folder, provider
@@ -191,7 +191,7 @@ class Page:
             api_visibility="private",
         )
         # Loaded when its tab is opened, under a new name each time: Gradio's viewer stays empty if its value
-        # arrives before it is visible, or twice.
+        # arrives before the viewer is visible, or if the same value arrives twice.
         self._cloud_tab.select(
             self._make_cloud, self._session, self._cloud, concurrency_id="matching", api_visibility="private"
         )
@@ -206,7 +206,7 @@ class Page:
         )
 
     def _fill_in_sample(self) -> dict[Any, Any]:
-        """Fill in the form with the sample pair of the package."""
+        """Fill in the form with the package's sample pair."""
         folder = sample_folder()
         return {
             self._left: str(folder / "left.jpg"),
@@ -234,14 +234,14 @@ class Page:
             }
 
     def _format_line(self, line: str) -> str:
-        """Put a message in one line, without this machine's folders."""
+        """Put a message on one line, without the names of this computer's folders."""
         return re.sub(rf"{re.escape(str(self._folder))}/\w+/", "", " ".join(line.splitlines()))
 
     def _format_error(self, error: Exception) -> str:
         return _format_notice([self._format_line(format_error(error, label_of))], problem=True)
 
     def _write_files(self, session: Session | None, progress: Any = gr.Progress()) -> dict[Any, Any]:  # noqa: B008
-        """Write the files; takes as long as everything shown before."""
+        """Write the result's files; this takes as long as everything before it together."""
         if session is None:
             return {self._files: None}
         _report_progress(progress, 0.8, "writing the files")
@@ -296,7 +296,7 @@ class Page:
         }
 
     def _render_view(self, session: Session | None, position: float) -> tuple[Any, str]:
-        """Render the view from a position. Returns it with a line about it."""
+        """Render the view from a position. Returns the image and a line that describes it."""
         if session is None:
             return gr.skip(), _GONE
         view = session.renderer.view(position)
@@ -304,14 +304,14 @@ class Page:
         return view.image, f"{position:g}, {_describe_position(position)}; {unseen}"
 
     def _make_cloud(self, session: Session | None) -> str | None:
-        """Write the point cloud. Returns its file."""
+        """Write the point cloud. Returns the path of its file; None if there is no point cloud."""
         cloud = session and write_cloud(session.folder / f"{uuid4().hex}.glb", session.result)
         return str(cloud) if cloud else None
 
     def _measure_click(
         self, session: Session | None, clicks: list[tuple[int, int]], event: gr.SelectData
     ) -> tuple[Any, str, list[tuple[int, int]]]:
-        """Mark the clicked points, at most two, in the left image, and measure there."""
+        """Mark the clicked points, at most two, in the left image, and describe their depth and distance."""
         if session is None:
             return gr.skip(), _format_paragraphs([_GONE]), []
         column, row = event.index
@@ -344,7 +344,7 @@ def _make_picture(label: str, name: str) -> gr.Image:
 
 
 def _format_notice(lines: Sequence[str], *, problem: bool = False) -> str:
-    """Format lines as HTML, one below the other; a problem is highlighted and read out by screen readers."""
+    """Format lines as HTML paragraphs; a problem is highlighted, and screen readers announce it at once."""
     look, role = ("notice problem", "alert") if problem else ("notice", "status")
     return f'<div class="{look}" role="{role}">{_format_paragraphs(lines)}</div>'
 
@@ -361,7 +361,7 @@ def _format_depth_legend(session: Session) -> str:
 
 
 def _format_confidence_legend() -> str:
-    key = f'<i class="key" style="background:{css_colour(OCCLUDED_RGB)}"></i>occluded, seen by the left only'
+    key = f'<i class="key" style="background:{css_colour(OCCLUDED_RGB)}"></i>occluded in the right view'
     return _format_legend("linear-gradient(90deg,#000,#fff)", "low", key, "high")
 
 
@@ -371,7 +371,7 @@ def _format_legend(colours: str, *labels: str) -> str:
 
 
 def _describe_position(position: float) -> str:
-    """Describe in words where a view is seen from."""
+    """Describe in words the position from which a view is seen."""
     if position in (0, 1):
         return "the right picture itself" if position else "the left picture itself"
     if position < 0:

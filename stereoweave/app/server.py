@@ -26,8 +26,8 @@ def make_server(folder: Path, names: Sequence[str] | None, provider: str = CPU) 
     """Make the page's ASGI application.
 
     Args:
-        folder: Holds uploads and results.
-        names: Allowed values of the header Host; None allows any.
+        folder: Folder for uploads and results.
+        names: Allowed values of the Host header; None allows any.
         provider: Hardware that runs the network.
     """
     os.environ["GRADIO_TEMP_DIR"] = str(folder)
@@ -56,7 +56,7 @@ def make_server(folder: Path, names: Sequence[str] | None, provider: str = CPU) 
 
 
 def _make_theme() -> gr.themes.Base:
-    """Return a plain theme with the fonts of the visitor's computer."""
+    """Return a plain theme that uses fonts installed on the visitor's computer."""
     return gr.themes.Base(
         primary_hue="blue",
         neutral_hue="slate",
@@ -72,9 +72,9 @@ def serve(
     """Serve the page on a listening socket until a signal stops it; then remove all uploads.
 
     Args:
-        listener: The socket.
-        names: Allowed values of the header Host; None allows any.
-        browsed: URL to open in the browser; None opens none.
+        listener: The listening socket.
+        names: Allowed values of the Host header; None allows any.
+        browsed: URL to open in the browser; if None, no browser is opened.
         provider: Hardware that runs the network.
     """
     _handle_signals()
@@ -88,7 +88,7 @@ def serve(
 
 
 def _handle_signals() -> None:
-    """Make SIGTERM and SIGHUP end the process by an exception, as Ctrl-C does."""
+    """Make SIGTERM and SIGHUP end the process with an exception, as Ctrl-C does."""
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     hang_up = getattr(signal, "SIGHUP", None)  # missing on Windows
     # An ignored SIGHUP, as under nohup, stays ignored. An exception inside Uvicorn's loop may hang, so SIGHUP

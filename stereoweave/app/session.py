@@ -1,4 +1,4 @@
-"""A visitor's result on the web page, independent of the page: matched, drawn, measured and written."""
+"""Matching, drawing, measuring and writing for a visitor of the web page, independent of the page itself."""
 
 import zipfile
 from collections.abc import Callable, Sequence
@@ -24,9 +24,10 @@ from stereoweave.stereo import Estimate, StereoCamera
 
 _LONGER_SIDE_PX = 1280
 _MOST_POINTS = 300_000
-# Times the median depth. The viewer fits all points: a few of a far horizon would shrink the rest to a dot.
+# Multiple of the median depth. The viewer fits all points into view: a few on a far horizon would shrink the
+# rest to a dot.
 _FARTHEST = 4.0
-# Files up to this size, those of about 8 megapixels, are on disk twice: by themselves and in the zip.
+# Files up to this total size, reached at about 8 megapixels, are stored twice: individually and in the zip.
 _MOST_ZIPPED_BYTES = 300 * 1024**2
 _NO_METRES = "For metres, give a calibration file, or the focal length and the baseline."
 
@@ -40,7 +41,7 @@ class Session:
     folder: Path
 
     def given_px(self, shown_px: tuple[int, int]) -> tuple[int, int]:
-        """Convert column and row of the shown picture to those of the given one."""
+        """Convert column and row in the displayed image to column and row in the full-size one."""
         given, shown = self.result.pair.left.shape[1::-1], self.renderer.pair.left.shape[1::-1]
         column, row = (
             round((at + 0.5) * n / m - 0.5) for at, n, m in zip(shown_px, given, shown, strict=True)
@@ -58,16 +59,16 @@ class Uploads:
 
 
 def match_uploads(uploads: Uploads, folder: Path, report_progress: Callable[[float, str], None]) -> Session:
-    """Match uploaded pictures; the session writes its files to `folder`.
+    """Match uploaded pictures. Returns the session, which keeps its files in `folder`.
 
-    `report_progress` gets the fraction done, 0 to 1, and the next step.
+    `report_progress` is called with the fraction done, 0 to 1, and the name of the next step.
     """
     if not uploads.pictures:
         raise StereoweaveError("expected a left and a right picture, or one file with both views, found none")
     for file in (*uploads.pictures, uploads.request.calibration):
         if file and not file.exists():
             raise StereoweaveError(
-                f"{file.name}: expected an upload of the last hour, found it expired; upload it again"
+                f"{file.name}: expected an upload from the last hour, found an expired one; upload it again"
             )
     report_progress(0.1, "reading")
     prepared = prepare(uploads.pictures, uploads.request)
@@ -80,7 +81,11 @@ def match_uploads(uploads: Uploads, folder: Path, report_progress: Callable[[flo
 
 
 def write_all(session: Session) -> tuple[list[Path], list[Note]]:
-    """Write the result's files in all formats. Returns them, with notes on missing files and on defects."""
+    """Write the result's files in all formats.
+
+    Returns:
+        The files, and notes on skipped files and on likely defects of the pair.
+    """
     result = session.result
     names = [name for name in FILES if result.pair.camera or not needs_camera(name)]
     notes = write_files(session.folder, names, result) + result.warnings()
@@ -88,7 +93,7 @@ def write_all(session: Session) -> tuple[list[Path], list[Note]]:
 
 
 def zip_files(file: Path, files: Sequence[Path]) -> Path | None:
-    """Put files into one zip archive without further compression; None if they are too large."""
+    """Put files into one zip archive without further compression. Returns None if they are too large."""
     if sum(path.stat().st_size for path in files) > _MOST_ZIPPED_BYTES:
         return None
     with zipfile.ZipFile(file, "w") as archive:
@@ -98,9 +103,9 @@ def zip_files(file: Path, files: Sequence[Path]) -> Path | None:
 
 
 def write_cloud(file: Path, result: Result) -> Path | None:
-    """Write the point cloud for the viewer, without its farthest points; return None if it has no points.
+    """Write the point cloud for the viewer, without the farthest points. Returns None if there are no points.
 
-    A camera is assumed if none is known. `cloud.glb` among the files has all points.
+    If the camera is unknown, one is assumed. The downloadable file `cloud.glb` has all points.
     """
     pair, estimate = result.pair, result.estimate
     seen = pair if pair.camera else replace(pair, camera=_assume_camera(estimate))
@@ -115,7 +120,7 @@ def write_cloud(file: Path, result: Result) -> Path | None:
 
 
 def colour_depth(session: Session) -> UInt8[np.ndarray, "h w 3"]:
-    """Colour the disparity; black outside the left picture's valid pixels."""
+    """Return the disparity as an RGB image [H, W, 3], black outside the left image's content."""
     disparity_px, seen = session.renderer.estimate.disparity_px, session.renderer.pair.left_seen
     if seen is None:
         return colour_disparity(disparity_px, find_colour_range_px(disparity_px))
@@ -123,7 +128,7 @@ def colour_depth(session: Session) -> UInt8[np.ndarray, "h w 3"]:
 
 
 def format_colour_range(result: Result) -> tuple[str, str]:
-    """Format the depths of the first and the last colour, in metres if they are known, else in px."""
+    """Format the depths of the first and the last colour, or the disparities if the camera is unknown."""
     seen = np.s_[:] if result.pair.left_seen is None else result.pair.left_seen
     ends_px = np.array([find_colour_range_px(np.atleast_2d(result.estimate.disparity_px[seen]))])
     if not result.pair.camera:
@@ -135,7 +140,7 @@ def format_colour_range(result: Result) -> tuple[str, str]:
 def mark_clicks(
     image: UInt8[np.ndarray, "h w 3"], clicks: Sequence[tuple[int, int]]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Draw a ring at each click, and a line between two."""
+    """Return the image with a ring at each click, and a line between two clicks."""
     marked = image.copy()
     for colour, width in (((0, 0, 0), 5), ((255, 255, 255), 2)):
         cv2.polylines(marked, [np.array(clicks, np.int32)], False, colour, width, cv2.LINE_AA)
@@ -145,7 +150,7 @@ def mark_clicks(
 
 
 def measure_clicks(session: Session, clicks: Sequence[tuple[int, int]]) -> list[str]:
-    """Describe each clicked point, and the distance between two."""
+    """Describe each clicked point, and the distance between two, in one line each."""
     estimate, camera = session.result.estimate, session.result.pair.camera
     points = [session.given_px(click) for click in clicks]
     lines = [_describe_pixel(session.result, point) for point in points]
@@ -160,12 +165,12 @@ def measure_clicks(session: Session, clicks: Sequence[tuple[int, int]]) -> list[
 
 
 def format_summary(summary: Summary) -> str:
-    """Format a result's summary: size, time, disparity, depth and confidence."""
+    """Format a result's size, time, disparity, depth and confidence as one line."""
     text = f"{summary.width_px}×{summary.height_px} px, matched in {summary.estimate_ms / 1000:.1f} s: "
     text += f"disparity {summary.disparity_min_px:.1f} to {summary.disparity_max_px:.1f} px"
     if summary.depth_min_m is not None:
         middle = _format_metres(summary.depth_median_m)
-        text += f", depth from {summary.depth_min_m:.2f} m, in the middle {middle}"
+        text += f", depth from {summary.depth_min_m:.2f} m, median {middle}"
     return f"{text}; confident in {summary.confident_percent:.0f} % of the picture"
 
 
@@ -174,7 +179,7 @@ def _format_metres(depth_m: float | None) -> str:
 
 
 def _describe_pixel(result: Result, point: tuple[int, int]) -> str:
-    """Describe one pixel of the given left picture."""
+    """Describe the disparity, depth and confidence at a pixel of the full-size left image."""
     column, row = point
     disparity_px = result.estimate.disparity_px[row : row + 1, column : column + 1]
     text = f"({column}, {row}): disparity {disparity_px[0, 0]:.2f} px"
@@ -184,9 +189,9 @@ def _describe_pixel(result: Result, point: tuple[int, int]) -> str:
 
 
 def _assume_camera(estimate: Estimate) -> StereoCamera:
-    """Assume a field of view of 53 degrees and a baseline of human eyes, for a plausible point cloud.
+    """Return a camera that gives a plausible point cloud: 53 degrees of view, the baseline of human eyes.
 
-    Negative disparities mean converged cameras: the least one is taken to be far away.
+    Negative disparities mean converged cameras: the lowest disparities are then taken to be infinitely far.
     """
     height, width = estimate.disparity_px.shape
     return StereoCamera(

@@ -1,4 +1,4 @@
-"""What a visitor of the page may have read: his own uploads and results and the sample, and no other file."""
+"""A visitor of the page can read their own uploads and results and the sample, and no other file."""
 
 import json
 import os
@@ -24,7 +24,7 @@ from stereoweave.io.images import read_image, write_image
 pytestmark = pytest.mark.system
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
-REFUSED = (403, "expected a file that you gave to this page or that it made of yours; give it again")
+REFUSED = (403, "expected a file that you uploaded or that this page made for you; upload the pictures again")
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def visitor(address) -> Iterator[Visitor]:
 
 @pytest.fixture(scope="module")
 def small_pair(tmp_path_factory) -> list[Path]:
-    """A pair that is quickly matched."""
+    """Write a pair that is small enough to be matched quickly. Returns its files."""
     files = [tmp_path_factory.mktemp("pair") / f"{side}.png" for side in ("left", "right")]
     for file in files:
         write_image(file, read_image(EXAMPLES / file.name)[200:264, 200:328])
@@ -57,7 +57,7 @@ def small_pair(tmp_path_factory) -> list[Path]:
 
 @pytest.fixture(scope="module")
 def resident(address, small_pair) -> Iterator[tuple[Visitor, list[str], str]]:
-    """Another visitor, his uploads, and the answer to them."""
+    """Yield another visitor, their uploads, and the page's answer to these."""
     with Visitor(address) as visitor:
         left, right = uploads = visitor.upload(*small_pair)
         status, said = visitor.answer(visitor.press(left=file_data(left), right=file_data(right)))
@@ -66,14 +66,14 @@ def resident(address, small_pair) -> Iterator[tuple[Visitor, list[str], str]]:
 
 
 def paths_in(said: str) -> list[str]:
-    """The paths of the files in an answer of the page."""
+    """Return the paths of all files that an answer of the page names."""
     found: list[str] = []
     json.loads(said, object_hook=lambda part: found.append(part.get("path")) or part)
     return [path for path in found if path]
 
 
 def spellings(file: Path, uploaded: str, listener: socket.socket) -> list[str]:
-    """Ways to name a file of the server's disk, for who has uploaded one file himself."""
+    """Return different names for a file on the server's disk; some start from the visitor's own upload."""
     relative, url = os.path.relpath(file), f"http://127.0.0.1:{listener.getsockname()[1]}/left.png"
     link = file.with_name(f"link-to-{file.name}")
     link.symlink_to(file)
@@ -97,7 +97,7 @@ def spellings(file: Path, uploaded: str, listener: socket.socket) -> list[str]:
 
 
 def forged_bodies(visitor: Visitor, path: str, uploaded: str) -> Iterator[dict[str, Any]]:
-    """Requests of the form that name a file which is not the visitor's."""
+    """Yield submissions of the form that name a file of somebody else."""
     for field in ("left", "right", "calibration"):
         yield visitor.press(**{"left": file_data(uploaded), field: file_data(path)})
     yield visitor.press(left=[file_data(path)])
@@ -107,7 +107,7 @@ def forged_bodies(visitor: Visitor, path: str, uploaded: str) -> Iterator[dict[s
 
 
 def other_ways(path: str) -> Iterator[tuple[str, str]]:
-    """Addresses under which Gradio has handed out files, or has fetched them from elsewhere."""
+    """Yield addresses under which Gradio has served files, or fetched them from other servers."""
     encoded = quote(path, safe="").replace(".", "%2E")
     for route in ("file=", "file/", "proxy=", "stream/", "custom_component/0/client/component/"):
         yield "GET", f"/gradio_api/{route}{encoded}"
@@ -118,7 +118,7 @@ def other_ways(path: str) -> Iterator[tuple[str, str]]:
 
 
 def refusals(visitor: Visitor, path: str, uploaded: str) -> Iterator[tuple[int, str]]:
-    """The answers to all forged requests for one spelling of a file."""
+    """Yield the answers to all forged requests for a file under one of its names."""
     for body in forged_bodies(visitor, path, uploaded):
         yield visitor.answer(body)
     for method, url in other_ways(path):
@@ -127,7 +127,7 @@ def refusals(visitor: Visitor, path: str, uploaded: str) -> Iterator[tuple[int, 
         yield answer.status_code, answer.text
 
 
-def test_no_forged_request_reads_a_file_or_tells_whether_it_is_there(visitor, folder, small_pair, tmp_path):
+def test_no_forged_request_reads_a_file_or_reveals_whether_it_exists(visitor, folder, small_pair, tmp_path):
     [uploaded] = visitor.upload(small_pair[0])
     before, count = sorted(folder.rglob("*")), 0
     there, missing = tmp_path / "there.png", tmp_path / "missing.png"
@@ -145,7 +145,7 @@ def test_no_forged_request_reads_a_file_or_tells_whether_it_is_there(visitor, fo
     assert sorted(folder.rglob("*")) == before
 
 
-def test_what_a_visitor_uploaded_is_matched_and_its_results_are_his(resident):
+def test_a_visitor_s_upload_is_matched_and_its_results_are_theirs(resident):
     visitor, uploads, said = resident
     assert r"128\u00d764 px, matched in" in said
     shown = paths_in(said)
@@ -164,14 +164,14 @@ def test_another_visitors_uploads_and_results_are_refused_though_their_paths_are
         assert (answer.status_code, answer.text) == REFUSED
 
 
-def test_who_keeps_no_cookie_has_no_files(resident, visitor):
+def test_a_visitor_without_a_cookie_has_no_files(resident, visitor):
     visitor.http.cookies.clear()
     [path] = visitor.upload(EXAMPLES / "right.png")
     for named in (path, resident[1][0]):
         assert visitor.answer(visitor.press(left=file_data(named))) == REFUSED
 
 
-def test_the_sample_is_read_by_who_asked_for_it_alone(visitor, resident, small_pair):
+def test_the_sample_is_served_only_to_visitors_who_requested_it(visitor, resident, small_pair):
     status, said = visitor.answer(visitor.press("sample"))
     assert status == 200
     left, *_ = paths_in(said)
@@ -181,7 +181,7 @@ def test_the_sample_is_read_by_who_asked_for_it_alone(visitor, resident, small_p
     assert resident[0].answer(body) == REFUSED
 
 
-def test_an_upload_whose_name_has_blanks_and_accents_is_its_visitors(visitor, tmp_path):
+def test_an_upload_with_blanks_and_accents_in_its_name_is_its_visitor_s(visitor, tmp_path):
     file = tmp_path / "été à gauche #1 100%.txt"
     file.write_text("no picture")
     [path] = visitor.upload(file)
@@ -192,7 +192,7 @@ def test_an_upload_whose_name_has_blanks_and_accents_is_its_visitors(visitor, tm
 
 
 @pytest.mark.parametrize("content", ["[" * 100_000, "{", '"', " " * 2_000_000, "\xff", '{"path": 1}'])
-def test_what_is_no_request_of_the_form_is_refused(visitor, content):
+def test_an_invalid_request_body_is_refused(visitor, content):
     answer = visitor.http.post("/gradio_api/queue/join", content=content.encode("latin-1"))
     assert (answer.status_code, answer.text) == REFUSED
 
@@ -218,7 +218,7 @@ async def show_file(request: Request) -> PlainTextResponse:
 
 @pytest.fixture
 def page() -> Iterator[TestClient]:
-    """The gate before a little page: an upload lists the files that are named to its visitor."""
+    """Return a client of a minimal page behind the access control; an upload names files to its visitor."""
     routes = [
         Route("/gradio_api/upload", name_again, methods=["POST"]),
         Route("/gradio_api/file={path:path}", show_file),
@@ -251,23 +251,23 @@ def test_a_visitor_keeps_their_files_beside_the_cookies_of_other_servers_on_the_
 
 
 @pytest.mark.parametrize("method", ["POST", "PUT", "PATCH", "DELETE", "OPTIONS", "BREW"])
-def test_a_body_is_checked_whatever_the_method_is(page, method):
+def test_a_body_is_checked_for_every_method(page, method):
     answer = page.request(method, "/gradio_api/queue/join", json={"path": "/foreign.png"})
     assert (answer.status_code, answer.text) == REFUSED
 
 
-@pytest.mark.no_cover  # which takes time
-def test_a_long_cookie_of_another_server_does_not_hold_the_page_up(page):
+@pytest.mark.no_cover  # coverage would slow it down
+def test_a_long_cookie_of_another_server_does_not_delay_the_page(page):
     other = (
         'other="' + r"\a" * 30_000 + '"'
-    )  # some versions of Python take the square of its length to read it
+    )  # in some versions of Python, the time to parse it is quadratic in its length
     name_files(page, cookie_of(1), "/own.png")
     start_s = time.process_time()
     assert status_of(page, f"{other}; {cookie_of(1)}", "/own.png") == 200
     assert time.process_time() - start_s < 1
 
 
-def test_no_visitor_takes_the_files_of_another_by_naming_many(page):
+def test_many_files_of_one_visitor_do_not_displace_another_s(page):
     name_files(page, cookie_of(1), "/own.png")
     name_files(page, cookie_of(2), *(f"/{number}.png" for number in range(100_001)))
     assert status_of(page, cookie_of(1), "/own.png") == 200
@@ -276,10 +276,10 @@ def test_no_visitor_takes_the_files_of_another_by_naming_many(page):
     assert status_of(page, cookie_of(2), "/90001.png") == 200
 
 
-def test_of_more_than_1000_visitors_the_one_longest_unused_is_forgotten(page):
+def test_of_more_than_1000_visitors_the_least_recently_active_is_forgotten(page):
     for number in range(1000):
         name_files(page, cookie_of(number), "/own.png")
-    assert status_of(page, cookie_of(0), "/own.png") == 200  # now 1 is the longest unused
+    assert status_of(page, cookie_of(0), "/own.png") == 200  # now visitor 1 is the least recently active
     name_files(page, cookie_of(1000), "/own.png")
     kept = [status_of(page, cookie_of(number), "/own.png") for number in (0, 1, 2, 1000)]
     assert kept == [200, 403, 200, 200]

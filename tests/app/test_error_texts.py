@@ -1,4 +1,4 @@
-"""Error texts and notes of the page, where a setting is named by its label."""
+"""Error texts and notes of the page name a setting by its label."""
 
 import html
 import json
@@ -51,7 +51,7 @@ NOTES: dict[str, tuple[dict[str, str], dict[str, Any]]] = {
 
 @pytest.fixture(scope="module")
 def say(tmp_path_factory) -> Iterator[Say]:
-    """What the page says, line by line, when these files and fields are given to it."""
+    """Return a function that submits files and fields to the page and returns the lines of its notice."""
     folder = tmp_path_factory.mktemp("files")
     write_error_examples(folder)
     server, address = start(tmp_path_factory.mktemp("page"))

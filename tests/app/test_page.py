@@ -1,4 +1,4 @@
-"""The page in a browser: the command serves it, Chromium loads it, and nobody else is asked for anything."""
+"""The page in a browser: the command serves it, and Chromium loads it without requests to other servers."""
 
 import io
 import re
@@ -24,7 +24,7 @@ from stereoweave.io.colormap import colour_disparity, find_colour_range_px
 from stereoweave.io.images import read_image
 from stereoweave.io.maps import read_pfm
 from stereoweave.matching.backend import Backend
-from stereoweave.outputs.point_cloud import point_cloud
+from stereoweave.outputs.point_cloud import make_point_cloud
 from stereoweave.outputs.results import FILES
 from stereoweave.pictures.prepare import Request
 
@@ -34,7 +34,7 @@ FOCAL_PX = 480.0091990971134  # examples/calib.txt
 FOCAL_TIMES_BASELINE = FOCAL_PX * 0.4059954505992446
 UNDRAWN = "cannot draw in 3-D"
 WINDOW = {"width": 1280, "height": 1000}
-# A cold computer compiles the loops over pixels first.
+# Without compiled kernels in the cache, they are compiled first.
 PATIENCE_MS = 60_000
 
 pytestmark = [pytest.mark.system, pytest.mark.needs_chromium]
@@ -56,7 +56,7 @@ def browser() -> Iterator[Browser]:
 
 
 class Visit:
-    """One visitor's window; `asked` are the addresses that it asked for, `refused` those it did not get."""
+    """One visitor's window; `asked` are the URLs that it requested, `refused` those that failed."""
 
     def __init__(self, browser: Any, address: str) -> None:
         self.asked: list[str] = []
@@ -70,18 +70,18 @@ class Visit:
         self.page.locator("#find").wait_for()
 
     def give(self, **files: Path) -> None:
-        """Puts files into the fields of these names."""
+        """Put files into the fields of these names."""
         for field, file in files.items():
             self.page.locator(f"#{field} input[type=file]").set_input_files(file)
             self.page.locator(f"#{field}").get_by_text(file.name.rsplit(".", 1)[0]).first.wait_for()
 
     def take_back(self) -> None:
-        """Empties the fields of pictures."""
+        """Clear the fields for pictures."""
         for _ in range(self.page.get_by_label("Clear").count()):
             self.page.get_by_label("Clear").first.click()
 
     def find(self) -> str:
-        """What the page says after its work, which is something new, when all files are there."""
+        """Find depth, wait until the notice has changed and all files exist, and return the notice."""
         said = self.page.locator("#status .notice")
         before = said.inner_text() if said.count() else ""
         self.page.click("#find")
@@ -96,7 +96,7 @@ class Visit:
         return said.inner_text()
 
     def move(self, position: str) -> np.ndarray:
-        """The new view after the slider was moved."""
+        """Move the slider and return the new view."""
         self.page.get_by_role("tab", name="View and depth").click()
         self.page.locator("#position input[type=range]").fill(position)
         self.page.locator("#where").get_by_text(re.compile(f"^{re.escape(position)}, ")).wait_for()
@@ -129,14 +129,14 @@ def hasty_visit(browser, address) -> Iterator[Visit]:
 
 @pytest.fixture
 def hasty(hasty_visit) -> Visit:
-    """A visitor who gives what is no pair, one thing after the other."""
+    """Return a visitor who repeatedly uploads something other than a pair."""
     hasty_visit.take_back()
     return hasty_visit
 
 
 @pytest.fixture(scope="module")
 def answered(browser, address) -> Iterator[Visit]:
-    """A visitor who gave the example pair and has its result."""
+    """Yield a visitor who has uploaded the example pair and has its result."""
     visit = Visit(browser, address)
     visit.give(left=EXAMPLES / "left.png", right=EXAMPLES / "right.png")
     visit.page.get_by_text("More about the pictures").click()
@@ -150,7 +150,7 @@ def difference(one: np.ndarray, other: np.ndarray) -> float:
     return float(np.abs(one.astype(float) - other).mean())
 
 
-def test_the_slider_moves_from_the_left_photograph_to_the_right_one(answered):
+def test_the_slider_moves_from_the_left_image_to_the_right_one(answered):
     left, right = (read_image(EXAMPLES / f"{side}.png") for side in ("left", "right"))
     assert difference(left, right) > 16
     assert difference(answered.move("0"), left) < 4
@@ -233,7 +233,7 @@ def test_the_sample_needs_one_click_and_has_metres(visit):
     visit.page.locator("#status").get_by_text("depth from").wait_for()
 
 
-def test_a_focal_length_that_can_be_none_is_told(hasty):
+def test_an_invalid_focal_length_is_reported(hasty):
     hasty.give(left=EXAMPLES / "left.png", right=EXAMPLES / "right.png")
     hasty.page.get_by_text("More about the pictures").click()
     for name in ("focal", "baseline"):
@@ -255,7 +255,7 @@ def test_the_page_fits_a_telephone(answered):
     assert width == 390
 
 
-def test_a_browser_that_draws_no_points_is_told(browser, address):
+def test_a_browser_without_webgl_gets_a_notice(browser, address):
     with_none = browser.browser_type.launch(
         executable_path=shutil.which("chromium"), args=["--no-sandbox", "--disable-3d-apis"]
     )
@@ -266,14 +266,14 @@ def test_a_browser_that_draws_no_points_is_told(browser, address):
     with_none.close()
 
 
-def test_an_upload_that_was_put_away_is_asked_for_again(tmp_path):
+def test_an_expired_upload_is_requested_again(tmp_path):
     request = Request(calibration=tmp_path / "calib.txt")
     uploads = Uploads(
         pictures=(EXAMPLES / "left.png", EXAMPLES / "right.png"), request=request, backend=Backend()
     )
     with pytest.raises(
         StereoweaveError,
-        match=r"^calib.txt: expected an upload of the last hour, found it expired; upload it again$",
+        match=r"^calib.txt: expected an upload from the last hour, found an expired one; upload it again$",
     ):
         match_uploads(uploads, tmp_path, lambda share, what: None)
 
@@ -288,7 +288,7 @@ def test_large_files_are_not_zipped(tmp_path):
     assert zip_files(tmp_path / "all.zip", [small]) == tmp_path / "all.zip"
 
 
-def test_what_is_no_picture_is_told_by_its_name_alone(hasty, tmp_path):
+def test_an_invalid_picture_is_named_without_its_folder(hasty, tmp_path):
     (tmp_path / "notes.txt").write_text("no picture")
     hasty.give(left=tmp_path / "notes.txt", right=EXAMPLES / "right.png")
     said = hasty.find()
@@ -297,7 +297,7 @@ def test_what_is_no_picture_is_told_by_its_name_alone(hasty, tmp_path):
     assert hasty.page.locator("#status .notice").get_attribute("role") == "alert"
 
 
-def test_nothing_given_is_told(hasty):
+def test_a_form_without_pictures_is_reported(hasty):
     assert hasty.find() == "expected a left and a right picture, or one file with both views, found none"
 
 
@@ -326,7 +326,7 @@ def test_a_file_of_more_than_200_megabytes_is_refused(hasty, tmp_path):
     hasty.page.get_by_text(re.compile("exceed the maximum allowed size of 200")).first.wait_for()
 
 
-def test_the_page_asks_nobody_but_its_server(answered, address):
+def test_the_page_sends_requests_only_to_its_server(answered, address):
     elsewhere = [url for url in answered.asked if not url.startswith((address, "data:", "blob:"))]
     assert len(answered.asked) > 50
     assert elsewhere == []
@@ -342,6 +342,6 @@ def test_a_far_horizon_does_not_shrink_the_viewers_point_cloud(tmp_path):
     session = match_uploads(uploads, tmp_path, lambda share, what: None)
     drawn = trimesh.load(write_cloud(tmp_path / "drawn.glb", session.result), force="scene").to_geometry()
     depth_m = -drawn.vertices[:, 2]
-    everything_m = point_cloud(session.result.pair, session.result.estimate).points_m[:, 2]
+    everything_m = make_point_cloud(session.result.pair, session.result.estimate).points_m[:, 2]
     assert depth_m.max() <= 4 * np.median(everything_m) < 50 < everything_m.max()
     assert len(depth_m) > 0.8 * len(everything_m)

@@ -1,4 +1,4 @@
-"""The page's server: who may open it, and what it gives out."""
+"""The page's server restricts who may open the page and which files it serves."""
 
 import http.client
 import socket
@@ -29,7 +29,7 @@ def asked(address: str, path: str = "/", **headers: str) -> http.client.HTTPResp
         return answer
 
 
-def test_the_browser_is_told_to_load_nothing_from_elsewhere(address):
+def test_browsers_are_told_to_load_nothing_from_other_servers(address):
     policy = asked(address).headers["content-security-policy"]
     sources = set(policy.removeprefix("default-src ").split())
     assert sources == {"'self'", "'unsafe-inline'", "'unsafe-eval'", "data:", "blob:"}
@@ -44,19 +44,19 @@ def test_a_foreign_name_for_this_computer_does_not_open_the_page(address):
 
 
 @pytest.mark.parametrize("path", [__file__, "/etc/passwd", "../../etc/passwd", "%2Fetc%2Fpasswd"])
-def test_a_file_that_nobody_gave_to_the_page_is_not_given_out(address, path):
+def test_a_file_that_nobody_uploaded_is_not_served(address, path):
     assert asked(address, f"/gradio_api/file={path}").status == 403
 
 
 def test_only_this_computer_is_served(address):
     port = int(address.rsplit(":", 1)[1])
     assert address == f"http://127.0.0.1:{port}"
-    # The second address of this computer: only who listens on all of them would answer.
+    # A second address of this computer: only a server that listens on all addresses would answer.
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection(("127.0.0.2", port), timeout=5)
 
 
-def test_a_port_that_is_taken_is_one_line(address, capsys):
+def test_a_port_in_use_is_a_one_line_error(address, capsys):
     port = address.rsplit(":", 1)[1]
     assert main(["app", "--port", port]) == 2
     said = capsys.readouterr().err
