@@ -1,7 +1,7 @@
-"""What the tests share, and which of them need something that a bare machine does not have.
+"""Fixtures that tests share, and handling of tests that need more than a bare machine has.
 
-A marker of `CAPABILITIES` on a test says what it needs. Where that is missing the test is left out, and the
-summary says so; with STEREOWEAVE_REQUIRE_ALL=1 it fails instead.
+A marker from `CAPABILITIES` states what a test needs. If that is missing, the test is skipped and counted in
+the summary; with STEREOWEAVE_REQUIRE_ALL=1 it fails instead.
 """
 
 import gc
@@ -37,7 +37,7 @@ class Capability(NamedTuple):
 
 
 def renders() -> bool:
-    """Whether OpenGL works without a window; tried in a process of its own, which a broken driver may end."""
+    """Return whether OpenGL works without a window; tested in another process, which a driver may crash."""
     program = "import moderngl; moderngl.create_context(standalone=True, backend='egl')"
     return subprocess.run([sys.executable, "-c", program], capture_output=True, check=False).returncode == 0
 
@@ -61,10 +61,10 @@ CAPABILITIES = {
     ),
 }
 
-# As `ray_engine.set_environment` sets it before Ray is imported; tests import Ray at their beginning.
+# The value that `ray_engine.set_environment` sets before it imports Ray; tests import Ray earlier.
 os.environ["RAY_DEDUP_LOGS_SKIP_REGEX"] = ".*"
 
-# The garbage collector would go through all that is imported, again and again: a quarter of the tests' time.
+# The garbage collector would traverse all imported modules repeatedly, for a quarter of the tests' time.
 gc.disable()
 
 MISSING = [name for name, capability in CAPABILITIES.items() if not capability.present]
@@ -73,7 +73,7 @@ LEFT_OUT = pytest.StashKey[dict[str, int]]()
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    # Those of no room first, which are the longest: at the end one process would wait for them.
+    # The tests directly in tests/ first: they take longest, and one process would end late because of them.
     items.sort(key=lambda item: item.path.parent != Path(__file__).parent)
     if os.environ.get("STEREOWEAVE_REQUIRE_ALL") == "1":
         return
@@ -81,7 +81,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     config.stash[LEFT_OUT] = {
         name: sum(item.get_closest_marker(name) is not None for item in left_out) for name in MISSING
     }
-    if hasattr(config, "workeroutput"):  # of several processes, whose results one process shows
+    if hasattr(config, "workeroutput"):  # a worker of pytest-xdist; the controller shows the results
         config.workeroutput["left_out"] = config.stash[LEFT_OUT]
     items[:] = [item for item in items if item not in left_out]
     config.hook.pytest_deselected(items=left_out)
@@ -100,7 +100,7 @@ def pytest_testnodedown(node: WorkerController) -> None:
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
     for name in filter(item.get_closest_marker, MISSING):
-        pytest.fail(f"{CAPABILITIES[name].missing}; STEREOWEAVE_REQUIRE_ALL=1 forbids to leave it out")
+        pytest.fail(f"{CAPABILITIES[name].missing}; STEREOWEAVE_REQUIRE_ALL=1 forbids skipping this test")
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
@@ -119,36 +119,33 @@ def rng() -> np.random.Generator:
 
 @pytest.fixture
 def testdata() -> Path:
-    """The folder of real pictures and of the referee, for tests that carry the marker `testdata`."""
+    """Return the folder of real pictures and the referee, for tests with the marker `testdata`."""
     return TESTDATA
 
 
 @pytest.fixture
 def without_shape_checks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As users run the package, for tests of the errors that users see where jaxtyping would speak first."""
+    """Disable jaxtyping's checks, so that a test sees the errors that users see."""
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
 
 
 @pytest.fixture(scope="session")
 def ray_address(s3: str) -> Iterator[str]:
-    """The address of a Ray of 2 CPUs that was started for the tests, as `--address` takes it.
-
-    Its workers reach the S3 server of the tests as well.
-    """
+    """Yield the address, for `--address`, of a Ray cluster with 2 CPUs that can reach the S3 server."""
     with ray_head(cpus=2) as address:
         yield address
 
 
 @pytest.fixture
 def guarded_ray_address() -> Iterator[str]:
-    """The address of a Ray whose token is 64 times the letter a."""
+    """Yield the address of a Ray cluster whose token is 64 times the letter a."""
     with ray_head(cpus=1, RAY_AUTH_MODE="token", RAY_AUTH_TOKEN=64 * "a") as address:
         yield address
 
 
 @contextmanager
 def ray_head(cpus: int, **variables: str) -> Iterator[str]:
-    """Ray, started by its own command and on ports of its own, for as long as the block lasts."""
+    """Run a Ray cluster on free ports until the end of the block. Yields its address."""
     port, client_port = find_free_ports(2)
     # Directly below /tmp: the names of Unix sockets have at most 107 bytes.
     with tempfile.TemporaryDirectory(prefix="sw-", dir="/tmp", ignore_cleanup_errors=True) as folder:
@@ -170,11 +167,11 @@ def ray_head(cpus: int, **variables: str) -> Iterator[str]:
         paths = [str(root), str(root / "tests" / "helpers"), *filter(None, [os.environ.get("PYTHONPATH")])]
         with log.open("wb") as out:
             environment = os.environ | {
-                # Whoever has a token in his home folder would have to show it.
+                # A token in the user's home folder would otherwise be required.
                 "RAY_AUTH_MODE": "disabled",
-                # A head that reports nothing would report that.
+                # With usage reports turned off, the head node would still report that they are off.
                 "RAY_USAGE_STATS_REPORT_URL": "http://127.0.0.1:9",
-                # Workers import what tests define.
+                # Workers import modules of the tests.
                 "PYTHONPATH": os.pathsep.join(paths),
                 **variables,
             }
@@ -185,7 +182,7 @@ def ray_head(cpus: int, **variables: str) -> Iterator[str]:
             assert head.poll() is None, log.read_text()
             yield f"127.0.0.1:{port}"
         finally:
-            # Ended politely it would wait for half a minute; all its processes end with those of the node.
+            # On SIGTERM it would wait for half a minute. All processes of the cluster are among its children.
             for process in list_processes(head.pid):
                 with suppress(ProcessLookupError):
                     os.kill(process, signal.SIGKILL)
@@ -194,7 +191,7 @@ def ray_head(cpus: int, **variables: str) -> Iterator[str]:
 
 @pytest.fixture(scope="session")
 def s3() -> Iterator[str]:
-    """The endpoint of an S3 server on this machine, to which the environment leads from now on."""
+    """Yield the endpoint of an S3 server on this machine, which the environment variables point to."""
     from moto.server import ThreadedMotoServer
 
     server = ThreadedMotoServer("127.0.0.1", port=0, verbose=False)
@@ -205,7 +202,7 @@ def s3() -> Iterator[str]:
         "AWS_ACCESS_KEY_ID": "testing",
         "AWS_SECRET_ACCESS_KEY": "testing",
         "AWS_DEFAULT_REGION": "us-east-1",
-        # Whatever else this machine's user has for Amazon.
+        # Ignore the AWS settings of this machine's user.
         "AWS_CONFIG_FILE": os.devnull,
         "AWS_SHARED_CREDENTIALS_FILE": os.devnull,
         "AWS_EC2_METADATA_DISABLED": "true",
@@ -219,7 +216,7 @@ def s3() -> Iterator[str]:
 
 @pytest.fixture
 def bucket(s3: str) -> str:
-    """The URL of a new bucket of the S3 server."""
+    """Return the URL of a new bucket on the S3 server."""
     name = f"bucket-{uuid4().hex}"
     urlopen(Request(f"{s3}/{name}", method="PUT")).close()
     return f"s3://{name}"

@@ -13,12 +13,12 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 CONTRACTS = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
 
 PYTORCH = "The package imports PyTorch under learn alone, and no experiment"
-# Public in spite of their underscores: in named tuples and in the module os.
+# Public despite their underscores: names of named tuples and of the module os.
 DOCUMENTED = {"_asdict", "_exit", "_fields", "_replace"}
-# Lightning registers it with atexit, from where only its name removes it.
+# Lightning registers this function with atexit; only its name allows removing it.
 TOLERATED = {"_destroy_dist_connection"}
 
-# A contract, a file, and the line in it that the contract forbids.
+# A contract, a file, and a line in this file that the contract forbids.
 BREACHES = [
     ("Rooms import downwards", "matching/matcher.py", "import stereoweave.cameras.rig"),
     ("Rooms import downwards", "outputs/report.py", "import stereoweave.learn.recipe"),
@@ -50,7 +50,7 @@ def modules_without_pytorch() -> list[str]:
 
 
 def private_names(nodes: Iterable[ast.AST]) -> Iterator[str]:
-    """The names with one underscore that are imported, or read as attributes."""
+    """Return the names with one leading underscore that are imported or read as attributes."""
     for node in nodes:
         names: list[str] = []
         if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Load):
@@ -62,7 +62,7 @@ def private_names(nodes: Iterable[ast.AST]) -> Iterator[str]:
 
 
 def defined_names(nodes: Iterable[ast.AST]) -> Iterator[str]:
-    """The names of functions and classes, and of variables and attributes that are assigned."""
+    """Return the names of functions, classes, and assigned variables and attributes."""
     for node in nodes:
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
             yield node.name
@@ -70,7 +70,7 @@ def defined_names(nodes: Iterable[ast.AST]) -> Iterator[str]:
             yield node.id if isinstance(node, ast.Name) else node.attr
 
 
-def test_importing_the_package_imports_nothing_but_itself_and_the_standard_library():
+def test_importing_the_package_imports_only_itself_and_the_standard_library():
     program = (
         "import sys; before = set(sys.modules); import stereoweave; "
         "after = {name.partition('.')[0] for name in sys.modules.keys() - before}; "
@@ -82,7 +82,7 @@ def test_importing_the_package_imports_nothing_but_itself_and_the_standard_libra
 def test_every_module_outside_learn_can_be_imported_without_pytorch_and_gradio():
     modules = modules_without_pytorch()
     assert "stereoweave.matching.matcher" in modules
-    for name in ("page", "server"):  # which the command `app` alone imports
+    for name in ("page", "server"):  # imported only by the command `app`
         modules.remove(f"stereoweave.app.{name}")
     program = (
         f"import sys, {', '.join(modules)}; "
@@ -109,7 +109,7 @@ def test_a_breach_of_a_contract_is_caught(tmp_path, contract, file, line):
     assert re.findall(r"^(.+?) BROKEN", done.stdout, re.MULTILINE) == [contract]
 
 
-def test_each_contract_has_a_breach_that_is_tried():
+def test_each_contract_has_a_breach_that_is_tested():
     assert {contract["name"] for contract in CONTRACTS} == {contract for contract, _, _ in BREACHES}
 
 

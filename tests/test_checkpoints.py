@@ -1,4 +1,4 @@
-"""The index of the trained networks in checkpoints/: complete, with the right checksums, and true."""
+"""The index of the trained networks in checkpoints/ is complete and correct."""
 
 import hashlib
 import tomllib
@@ -24,7 +24,7 @@ def test_each_checksum_is_that_of_the_file():
 
 
 @pytest.mark.parametrize("name", INDEX)
-def test_the_index_says_of_a_training_what_the_checkpoint_says(name):
+def test_the_index_agrees_with_the_checkpoint_about_its_training(name):
     entry, kept = INDEX[name], checkpoint.load(FOLDER / INDEX[name]["file"])
     assert (entry["commit"], entry["steps"]) == (kept.commit, kept.step)
     assert (tomllib.loads((ROOT / entry["recipe"]).read_text())["name"]) == kept.recipe.name

@@ -12,12 +12,12 @@ CURVES = [{"max_disparity_px": 192.0}, {"max_depth_m": 15.0}]
 
 
 def truths(maximum):
-    """Values over the whole range, 0 left out, with many near either end."""
+    """Return values over the whole range except 0, with many near both ends."""
     near_zero = np.geomspace(1e-7, 0.5, 500)
     return maximum * np.concatenate([near_zero, 1 - near_zero, [1.0]])
 
 
-def test_the_code_of_disparity_is_its_share_of_the_maximum_to_the_power_p():
+def test_the_code_of_a_disparity_is_its_share_of_the_maximum_raised_to_p():
     curve = DepthCurve(max_disparity_px=200.0)  # p = 1.5
     np.testing.assert_allclose(curve.encode(np.array([[0.0, 8.0, 50.0, 200.0]])), [[0, 0.008, 0.125, 1]])
 
@@ -50,7 +50,7 @@ def test_encoding_what_was_decoded_gives_back_every_code(exponent):
 
 
 @pytest.mark.parametrize("exponent", EXPONENTS)
-def test_the_straight_line_at_the_far_end_leaves_the_paper_by_less_than_1e_5(exponent):
+def test_the_straight_line_at_the_far_end_deviates_from_the_paper_by_less_than_1e_5(exponent):
     curve = DepthCurve(max_disparity_px=1.0, exponent=exponent)
     share = truths(1.0)
     paper = share**exponent
@@ -148,32 +148,32 @@ def test_a_maximum_must_be_positive_and_finite(name, maximum):
 
 
 @pytest.mark.parametrize("maxima", [{}, {"max_disparity_px": 192.0, "max_depth_m": 15.0}])
-def test_exactly_one_maximum_says_what_is_encoded(maxima):
+def test_exactly_one_maximum_must_be_given(maxima):
     with pytest.raises(StereoweaveError, match="exactly one of max_disparity_px and max_depth_m"):
         DepthCurve(**maxima)
 
 
 @pytest.mark.parametrize("exponent", [1.25, 2.0, 3.7])
 @pytest.mark.parametrize("bins", [2, 10, 256])
-def test_pixels_spread_as_u_to_the_p_give_that_p(exponent, bins):
+def test_pixels_distributed_as_u_to_the_p_give_that_p(exponent, bins):
     histogram = np.diff(np.linspace(0, 1, bins + 1) ** exponent)
     assert fit_exponent(histogram) == pytest.approx(exponent, abs=1e-3)
 
 
-def test_counts_fit_as_shares_do():
-    # Of 100 pixels 1, 3, 5 ... 19 in ten bins: k bins hold k^2 together, which is u^2.
+def test_counts_give_the_same_fit_as_shares():
+    # Ten bins hold 1, 3, 5, ..., 19 of 100 pixels: the first k bins hold k^2, so the distribution is u^2.
     assert fit_exponent(np.arange(1, 20, 2)) == pytest.approx(2, abs=1e-3)
 
 
-def test_the_best_fit_of_a_histogram_that_is_no_power():
-    # Edges 1/3 and 2/3, cumulative 0.3 and 0.3: least squares tried one by one.
+def test_the_best_fit_to_a_histogram_that_is_not_a_power():
+    # Edges 1/3 and 2/3, cumulative shares 0.3 and 0.3: the least squares of all exponents, tried one by one.
     exponents = np.arange(1, 8, 1e-4)
     errors = ((1 / 3) ** exponents - 0.3) ** 2 + ((2 / 3) ** exponents - 0.3) ** 2
     assert fit_exponent(np.array([3, 0, 7])) == pytest.approx(exponents[errors.argmin()], abs=1e-3)
 
 
 @pytest.mark.parametrize("histogram", [[5, 0, 0, 0], [9, 3, 1, 0], [1, 1, 1, 1]])
-def test_a_set_that_is_mostly_far_or_even_gets_exactly_one(histogram):
+def test_a_mostly_far_or_uniform_set_gets_exponent_one(histogram):
     assert fit_exponent(np.array(histogram)) == 1
 
 
@@ -192,6 +192,6 @@ def test_a_set_that_is_all_near_gets_the_largest_exponent():
         ([1.0, np.inf], "with the sum inf"),
     ],
 )
-def test_a_histogram_that_counts_nothing_is_refused(histogram, found):
+def test_an_empty_histogram_is_refused(histogram, found):
     with pytest.raises(StereoweaveError, match=found):
         fit_exponent(np.array(histogram))

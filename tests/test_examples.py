@@ -1,4 +1,4 @@
-"""The scripts in examples/, run as a user would, and the messages of the ROS 2 node."""
+"""The scripts in examples/ run as a user would run them, and the messages of the ROS 2 node are correct."""
 
 import importlib.util
 import re
@@ -27,7 +27,7 @@ EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 
 @pytest.fixture
 def run(tmp_path, monkeypatch, capsys) -> Callable[..., str]:
-    """Runs a script of these words in an empty folder, in this process; what it said is given back."""
+    """Return a function that runs a script with arguments in an empty folder and returns its output."""
     monkeypatch.chdir(tmp_path)
 
     def ran(script: str, *words: str) -> str:
@@ -60,7 +60,7 @@ def test_depth_of_a_pair(run, tmp_path):
     said = run("depth_of_a_pair.py")
     depth_mm = read_pixels(tmp_path / "depth.png", "I;16")
     assert depth_mm.shape == (480, 640)
-    # The bow and the water before it are 3.5 to 5 m away. The sky is too far for 16 bits: it is 0.
+    # The bow and the water in front of it are 3.5 to 5 m away. The sky is too far for 16 bits, so it is 0.
     ground_m = depth_mm[300:] / 1000
     assert 3 < np.percentile(ground_m, 1) < np.percentile(ground_m, 50) < 6
     assert (depth_mm[:50] == 0).mean() > 0.5
@@ -125,7 +125,7 @@ def test_torch_tensors(run, tmp_path):
     assert 0 <= features[0, 4].min() <= features[0, 4].max() <= 1
 
 
-def test_each_script_is_short_says_what_it_shows_and_is_run_here():
+def test_each_script_is_short_documented_and_run_in_these_tests():
     for script in EXAMPLES.glob("*.py"):
         text = script.read_text(encoding="utf-8")
         assert len(text.splitlines()) < 45
@@ -134,7 +134,7 @@ def test_each_script_is_short_says_what_it_shows_and_is_run_here():
         assert f"def test_{script.stem}(" in Path(__file__).read_text(encoding="utf-8")
 
 
-# The messages, field by field as ROS 2's definitions have them (std_msgs, sensor_msgs, stereo_msgs).
+# The messages, with the fields of ROS 2's definitions (std_msgs, sensor_msgs, stereo_msgs).
 
 
 @dataclass
@@ -216,7 +216,7 @@ class CameraInfo:
 
 
 def set_known(message: object, name: str, value: object) -> None:
-    """As ROS's messages do: no other field can be set, and no NumPy number."""
+    """Set a field as ROS's messages do: unknown fields and NumPy numbers are refused."""
     assert name in type(message).__dataclass_fields__  # type: ignore[attr-defined]
     assert not isinstance(value, np.generic)
     object.__setattr__(message, name, value)
@@ -239,7 +239,7 @@ HEADER = Header(frame_id="left_optical")
 
 
 def estimate_of_two_rows() -> Estimate:
-    """Disparities of which one is doubtful, one at infinity and one occluded."""
+    """Return an estimate with a pixel of low confidence, one at infinity and an occluded one."""
     return Estimate(
         disparity_px=np.array([[8, 3, 23], [-2, 8, 8]], np.float32),
         right_disparity_px=np.zeros((2, 3), np.float32),
@@ -262,7 +262,7 @@ DEPTH_M = [[5, np.nan, 2], [np.inf, np.nan, 5]]
         ("mono8", [7]),
     ],
 )
-def test_a_picture_is_read_from_its_message_whatever_its_encoding(conversions, encoding, pixel):
+def test_an_image_is_read_from_a_message_of_any_encoding(conversions, encoding, pixel):
     rows = bytes(4 * pixel) + b"padding", bytes(4 * pixel) + b"padding"
     message = ImageMessage(
         height=2, width=4, encoding=encoding, step=4 * len(pixel) + 7, data=rows[0] + rows[1]
@@ -272,12 +272,12 @@ def test_a_picture_is_read_from_its_message_whatever_its_encoding(conversions, e
     assert (rgb == ([7, 7, 7] if encoding == "mono8" else [1, 2, 3])).all()
 
 
-def test_a_picture_of_another_encoding_is_named(conversions):
+def test_an_unknown_encoding_is_named(conversions):
     with pytest.raises(ValueError, match="found 'bayer_rggb8'"):
         conversions.rgb_of(ImageMessage(encoding="bayer_rggb8"))
 
 
-def test_the_camera_is_that_of_both_projection_matrices(conversions):
+def test_the_camera_comes_from_both_projection_matrices(conversions):
     left = CameraInfo(p=[100, 0, 1, 0, 0, 100, 0, 0, 0, 0, 1, 0])
     right = CameraInfo(p=[100, 0, 3, -50, 0, 100, 0, 0, 0, 0, 1, 0])
     assert conversions.camera_of(left, right) == CAMERA
@@ -301,9 +301,9 @@ def test_the_disparity_message_gives_the_depth_by_its_own_formula(conversions):
     known = conversions.known_of(estimate, 0.5)
     conversions.fill_disparity(message, HEADER, estimate, CAMERA, known, (0, 20))
     assert message.header is message.image.header is HEADER
-    assert (message.min_disparity, message.max_disparity) == (2, 22)  # and doffs
+    assert (message.min_disparity, message.max_disparity) == (2, 22)  # plus doffs
     disparity_px = np.array(struct.unpack("<6f", message.image.data))
-    # Doubtful, beyond the range (23 and -2) and occluded ones are below the least.
+    # Pixels that are unreliable, occluded or beyond the range (23 and -2) are below the minimum.
     valid = disparity_px >= message.min_disparity
     assert valid.tolist() == [True, False, False, False, False, True]
     assert (message.f * message.t / disparity_px[valid]).tolist() == [5, 5]
@@ -320,9 +320,9 @@ def test_the_cloud_has_a_point_of_16_bytes_for_each_pixel(conversions):
     assert (message.height, message.width, message.point_step, message.row_step) == (2, 3, 16, 48)
     assert (message.is_bigendian, message.is_dense, len(message.data)) == (False, False, 96)
     points = list(struct.iter_unpack("<fffI", message.data))
-    # Column 0 of row 0, 5 m away: x = (0 - 1) / 100 * 5, y = 0; its colour is 0, 1, 2.
+    # Column 0 of row 0 is 5 m away: x = (0 - 1) / 100 * 5, y = 0; its colour is 0, 1, 2.
     assert points[0] == pytest.approx((-0.05, 0, 5, 0x000102))
-    # Column 2 of row 1: x = (2 - 1) / 100 * 5, y = 1 / 100 * 5; 15, 16, 17.
+    # Column 2 of row 1: x = (2 - 1) / 100 * 5, y = 1 / 100 * 5; its colour is 15, 16, 17.
     assert points[5] == pytest.approx((0.05, 0.05, 5, 0x0F1011))
     for unknown in (1, 3, 4):
         assert np.isnan(points[unknown][:3]).all()

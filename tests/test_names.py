@@ -1,4 +1,4 @@
-"""Names from anywhere: bytes that are no UTF-8, and words that spreadsheets would compute."""
+"""Unusual file names: bytes that are not UTF-8, and text that spreadsheets would run as formulas."""
 
 import csv
 import json
@@ -16,7 +16,7 @@ from stereoweave.cli.root import main
 from stereoweave.io.images import read_image, write_image
 
 TEXTURED = Path(__file__).resolve().parent / "textured_pair"
-# Names as a disk of another country's has them, in Latin-1: "grün", "grûn".
+# Names in Latin-1, as on old disks: "grün", "grûn".
 GREEN, GREENISH = os.fsdecode(b"gr\xfcn"), os.fsdecode(b"gr\xfbn")
 SHOWN, SHOWN_TOO = r"gr\udcfcn", r"gr\udcfbn"
 FORMULAS = ["=1+1", "@SUM(A1)", "+cmd|calc", "-2+3", "\tx", "\rx", "\nx", "'=1+1"]
@@ -27,7 +27,7 @@ pytestmark = pytest.mark.skipif(
 
 
 def write_pair(folder: Path, name: str) -> list[str]:
-    """The paths of a small pair's pictures."""
+    """Write a small pair. Returns the paths of its pictures."""
     folder.mkdir(exist_ok=True)
     files = [folder / f"{name}_{side}.png" for side in ("left", "right")]
     for file in files:
@@ -42,7 +42,7 @@ def table(file: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(opened))
 
 
-def test_a_report_shows_the_bytes_of_a_name_that_are_no_utf8(tmp_path, capsys):
+def test_a_report_shows_bytes_of_a_name_that_are_not_utf8(tmp_path, capsys):
     pair = write_pair(tmp_path / "in", GREEN)
     assert main(["depth", *pair, "-o", str(tmp_path / "out"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["pictures"] == [Path(file).name for file in pair]
@@ -81,7 +81,7 @@ def test_no_cell_is_a_formula_however_a_spreadsheet_splits_a_row(tmp_path):
         share: float
         scene: str
 
-    # A spreadsheet with German settings splits at semicolons, and knows no quotes inside a cell.
+    # A spreadsheet with German settings splits at semicolons, and does not recognise quotes within a cell.
     names = [
         *("a;=cmd|'/C calc'!A0", "a\t=1+1", "a; \t=1+1", "a\n=1+1", 'a,";=1+1', "a;'=1+1", "a;=1;=2"),
         *(" =1+1", "\u00a0=1+1", "\uff1d1+1", "a;\uff1d1+1", "' =1+1"),
@@ -98,7 +98,7 @@ def test_no_cell_is_a_formula_however_a_spreadsheet_splits_a_row(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["a;b", "a; b - c", "a\tb", "a=1", "-0.5"])
-def test_a_text_that_is_no_formula_stands_in_a_table_as_it_is(tmp_path, name):
+def test_text_that_is_not_a_formula_is_unchanged_in_a_table(tmp_path, name):
     @dataclass
     class Row:
         scene: str
@@ -107,17 +107,17 @@ def test_a_text_that_is_no_formula_stands_in_a_table_as_it_is(tmp_path, name):
     assert [row["scene"] for row in table(tmp_path / "rows.csv")] == [name]
 
 
-def test_the_console_shows_them_too(tmp_path):
+def test_the_console_shows_such_names(tmp_path):
     pair = write_pair(tmp_path / "in", GREEN)
     program = [sys.executable, "-m", "stereoweave", "rectify", *pair, "-o", str(tmp_path / GREEN)]
-    # As in most languages' environments; those of Python's own tests are lenient.
+    # Strict encoding, as in most environments; that of Python's own tests is lenient.
     strict = {**os.environ, "PYTHONIOENCODING": "utf-8:strict"}
     done = subprocess.run(program, capture_output=True, text=True, env=strict, check=False)
     assert done.returncode == 0, done.stderr
     assert f"{tmp_path}/{SHOWN}: left.png and right.png" in done.stdout
 
 
-def test_a_film_of_pictures_with_such_names_is_read(tmp_path):
+def test_a_video_of_pictures_with_such_names_is_read(tmp_path):
     for frame in range(2):
         write_pair(tmp_path / "in", f"{GREEN}{frame}")
     for side in ("left", "right"):

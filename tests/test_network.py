@@ -1,4 +1,4 @@
-"""No word to the outside: estimates, page, service and batch run while strace writes down whom they call."""
+"""Nothing is sent to other computers: strace records the connections of estimate, page, service and batch."""
 
 import os
 import re
@@ -23,7 +23,7 @@ from stereoweave.io.images import read_image, write_image
 
 TEXTURED = Path(__file__).resolve().parent / "textured_pair"
 PAIR = {side: TEXTURED / f"{side}.png" for side in ("left", "right")}
-# ONNX Runtime looks up where its reports go after some ten seconds.
+# ONNX Runtime looks up the address for its reports after about ten seconds.
 ALIVE_S = 20
 STRACE = ["strace", "-D", "-f", "-qq", "--seccomp-bpf", "-e", "trace=connect,sendto,sendmsg,sendmmsg"]
 STEREOWEAVE = [sys.executable, "-m", "stereoweave"]
@@ -44,7 +44,7 @@ import socket
 with socket.create_server(("127.0.0.1", 0)) as server, socket.create_connection(server.getsockname()):
     socket.getaddrinfo("localhost", 443)
 """
-# As strace writes addresses; in the data of a call it escapes quotation marks.
+# Addresses as strace writes them; within the data of a call, it escapes quotation marks.
 ADDRESS = re.compile(r'port=htons\((\d+)\).*?(?:inet_addr\(|inet_pton\(AF_INET6, )"([^"]+)"')
 RESOLVER = re.compile(r'sun_path="[^"]*systemd/resolve')
 DNS_PORT = 53
@@ -53,7 +53,7 @@ pytestmark = [pytest.mark.system, pytest.mark.needs_strace]
 
 
 def is_outside(line: str) -> bool:
-    """Whether a line of strace is a look-up, or a call of another address than loopback's."""
+    """Return whether a line of strace is a DNS query, or connects to an address other than loopback."""
     called = ADDRESS.findall(line)
     elsewhere = [address for port, address in called if int(port) == DNS_PORT or not is_loopback(address)]
     return bool(elsewhere or RESOLVER.search(line))
@@ -72,7 +72,7 @@ def calls_outside(trace: Path) -> list[str]:
 
 
 class Watched:
-    """A program under strace, as a user starts it who has set nothing."""
+    """A program under strace, started without any environment variables of the tests."""
 
     def __init__(self, command: Sequence[str], trace: Path) -> None:
         self.trace = trace
@@ -82,23 +82,23 @@ class Watched:
             [*STRACE, "-o", str(trace), *command],
             stdout=subprocess.PIPE,
             text=True,
-            # The names of Ray's sockets may not be long.
+            # The paths of Ray's sockets must be short.
             env={**kept, "RAY_TMPDIR": "/tmp", "PYTHONUNBUFFERED": "1"},
         )
 
     def wait_for(self, pattern: str) -> str:
-        """What matches in the lines that it prints."""
+        """Return the first match in the lines that the program prints."""
         assert self.process.stdout
         found = (re.search(pattern, line) for line in self.process.stdout)
         return next(match[0] for match in found if match)
 
     def part(self, name: str) -> psutil.Process:
-        """The process of that name among all that it started."""
+        """Return the process of this name among all that the program started."""
         started = psutil.Process(self.process.pid).children(recursive=True)
         return next(process for process in started if name in " ".join(process.cmdline()))
 
     def listeners(self) -> dict[tuple[str, int], str]:
-        """Where the program and all that it started listen, and the name of the process."""
+        """Return the addresses on which the program and its children listen, with the process names."""
         tree = psutil.Process(self.process.pid)
         return {
             tuple(connection.laddr): process.name()
@@ -110,7 +110,7 @@ class Watched:
 
 @contextmanager
 def watched(command: Sequence[str], trace: Path) -> Iterator[Watched]:
-    """For as long as the block lasts, to whose end it has to live; then nothing of it is left."""
+    """Run a program, which must not end before the block does; then end all its processes."""
     program = Watched(command, trace)
     try:
         yield program
@@ -125,7 +125,7 @@ def watched(command: Sequence[str], trace: Path) -> Iterator[Watched]:
 
 
 def write_small_pair(folder: Path) -> dict[str, Path]:
-    """A part of the example, for what is asked again and again."""
+    """Write a crop of the example, for repeated requests. Returns its files."""
     folder.mkdir()
     small = {side: folder / path.name for side, path in PAIR.items()}
     for side, path in small.items():
@@ -134,7 +134,7 @@ def write_small_pair(folder: Path) -> dict[str, Path]:
 
 
 def write_many_pairs(folder: Path) -> Path:
-    """More pairs than a worker makes meanwhile."""
+    """Write more pairs than a worker can process during the test."""
     for side, path in PAIR.items():
         (folder / side).mkdir(parents=True)
         for index in range(500):
@@ -144,7 +144,7 @@ def write_many_pairs(folder: Path) -> Path:
 
 @dataclass(frozen=True)
 class Seen:
-    """Calls to the outside, by program; where page and service listened, and what is answered there."""
+    """Connections to other computers by program, addresses of page and service, and answers of open ports."""
 
     outside: dict[str, list[str]]
     page: str
@@ -154,7 +154,7 @@ class Seen:
 
 @pytest.fixture(scope="module")
 def seen(tmp_path_factory) -> Seen:
-    """What four programs did in the same seconds."""
+    """Run four programs at the same time and return their network activity."""
     folder = tmp_path_factory.mktemp("network")
     pairs, out = write_many_pairs(folder / "pairs"), folder / "out"
     commands = {
@@ -174,7 +174,7 @@ def seen(tmp_path_factory) -> Seen:
             time.sleep(0.1)
         small = write_small_pair(folder / "small")
         with httpx.Client(base_url=page, timeout=60) as client:
-            with halted(programs["batch"].part("MapWorker")):  # which would keep a core busy
+            with halted(programs["batch"].part("MapWorker")):  # it would keep a core busy
                 ask_for(0.8 * ALIVE_S, Visitor(client), service, small)
             ask_for(0.2 * ALIVE_S, Visitor(client), service, small)
         listeners = programs["service"].listeners()
@@ -185,7 +185,7 @@ def seen(tmp_path_factory) -> Seen:
 
 
 def ask_for(seconds: float, visitor: Visitor, service: str, pair: dict[str, Path]) -> None:
-    """Keeps the page and the service at work."""
+    """Send requests to the page and the service for some seconds."""
     files = {side: path.read_bytes() for side, path in pair.items()}
     end_s = time.monotonic() + seconds
     while time.monotonic() < end_s:
@@ -196,22 +196,22 @@ def ask_for(seconds: float, visitor: Visitor, service: str, pair: dict[str, Path
 
 
 def ask_without_token(port: int) -> grpc.StatusCode:
-    """What a replica of Ray Serve answers to a call of somebody who has no token of this Ray."""
+    """Return the status with which a replica of Ray Serve answers a call without the cluster's token."""
     with grpc.insecure_channel(f"127.0.0.1:{port}") as channel, pytest.raises(grpc.RpcError) as refused:
         channel.unary_unary("/ray.serve.ASGIService/HandleRequest")(b"", timeout=10)
     return refused.value.code()
 
 
 @pytest.mark.parametrize("program", ["estimate", "page", "service", "batch"])
-def test_a_program_looks_nothing_up_and_calls_nobody_but_this_computer(seen, program):
+def test_a_program_makes_no_dns_query_and_connects_only_to_this_computer(seen, program):
     assert seen.outside[program] == []
 
 
-def test_the_page_answers_to_the_name_that_its_command_prints(seen):
-    assert seen.page.startswith("http://127.1:")  # where it was asked
+def test_the_page_listens_on_the_address_that_its_command_prints(seen):
+    assert seen.page.startswith("http://127.1:")  # the name given by --host
 
 
-def test_a_look_up_is_seen_and_a_call_to_this_computer_is_none(tmp_path):
+def test_a_dns_query_is_detected_and_a_connection_to_this_computer_is_not(tmp_path):
     outside = {}
     for name, program in {"look-up": LOOKING_UP, "itself": CALLING_ITSELF}.items():
         command = [*STRACE, "-o", str(tmp_path / name), sys.executable, "-c", program]

@@ -1,4 +1,4 @@
-"""The project's metadata: files at the root that repeat what the package and pyproject.toml say."""
+"""Files at the root agree with the package and pyproject.toml."""
 
 import ast
 import re
@@ -49,7 +49,7 @@ def normalise(distribution):
 
 
 def test_every_imported_package_is_declared():
-    # Of ray[serve], which the service runs on, and of the file systems for object stores.
+    # Dependencies of ray[serve], on which the service runs, and of the file systems for object stores.
     required_by_declared = {"fastapi", "starlette", "uvicorn", "fsspec"}
     lines = [*PROJECT["dependencies"], *sum(PROJECT["optional-dependencies"].values(), [])]
     declared = {normalise(re.match(r"[\w.-]+", line)[0]) for line in lines} | required_by_declared
@@ -80,7 +80,7 @@ def test_pre_commit_runs_the_tools_that_constraints_txt_pins():
 
 
 @pytest.mark.needs_git
-def test_files_above_500_kb_are_trained_networks_alone():
+def test_only_trained_networks_are_larger_than_500_kb():
     hook = hooks()["check-added-large-files"]
     assert "--maxkb=500" in hook["entry"]
     large = [name for name in repository_files(ROOT) if (ROOT / name).stat().st_size > 500 * 1024]

@@ -1,4 +1,4 @@
-"""The commands and programs of the README and the pages, run as users run them: outside the repository."""
+"""The commands and programs in the README and the docs run as users run them, outside the repository."""
 
 import csv
 import os
@@ -27,7 +27,7 @@ PAGES = {
 
 
 def blocks(page: str, language: str = "sh") -> list[str]:
-    """The code blocks of a page in a language."""
+    """Return the code blocks of a page in one language."""
     return re.findall(rf"```{language}\n(.*?)```", PAGES[page], re.DOTALL)
 
 
@@ -38,9 +38,9 @@ PROGRAMS = blocks("README.md", "python") + blocks("docs/python.md", "python")
     blocks(f"docs/{page}.md") for page in ("pictures", "views", "video", "synthetic", "paper")
 )
 BATCH = blocks("docs/cluster.md")[0]
-# 700e6 with the bytecode of all packages, which the tests leave out.
+# 700e6 with the bytecode of all packages, which the tests do not compile.
 LARGEST_ENVIRONMENT_BYTES = 650e6
-# The trainings of the README, in fewer steps and of fewer and smaller pairs.
+# Replacements that run the README's trainings with fewer steps and with fewer and smaller pairs.
 SHORTER = {
     "steps = 400": "steps = 2",
     "batch = 4": "batch = 2",
@@ -52,7 +52,7 @@ SHORTER = {
 
 
 def run(command: list[str | Path], folder: Path, **environment: str) -> str:
-    """What the command printed; an error of its own is shown whole."""
+    """Run a command and return its output, which is shown in full if the command fails."""
     done = subprocess.run(
         command, cwd=folder, env=os.environ | environment, capture_output=True, text=True, check=False
     )
@@ -61,7 +61,7 @@ def run(command: list[str | Path], folder: Path, **environment: str) -> str:
 
 
 def copied_repository(folder: Path) -> Path:
-    """What a fresh checkout has for users, in a folder of that name."""
+    """Copy the files that a fresh checkout has for users to a folder."""
     folder.mkdir()
     for name in ("LICENSE", "Makefile", "README.md", "constraints.txt", "pyproject.toml"):
         shutil.copy(REPOSITORY / name, folder)
@@ -75,7 +75,7 @@ def packages_in(environment: Path) -> set[str]:
 
 
 def write_pair(folder: Path) -> None:
-    """The files that the README's commands name: a pair of 96x64, 8 px apart, and a folder of one scene."""
+    """Write the files that the README's commands name: a 96x64 pair, 8 px apart, and a folder of a scene."""
     coarse = np.random.default_rng(0).integers(0, 256, (8, 13, 3), dtype=np.uint8)
     photograph = Image.fromarray(coarse).resize((104, 64))
     left, right = photograph.crop((0, 0, 96, 64)), photograph.crop((8, 0, 104, 64))
@@ -92,13 +92,13 @@ def write_pair(folder: Path) -> None:
 
 @pytest.fixture(scope="module")
 def caches(tmp_path_factory) -> str:
-    """Where the compiled kernels of these environments go, so that the user's cache keeps none of them."""
+    """Return a folder for the compiled kernels of these environments, so that the user's cache has none."""
     return str(tmp_path_factory.mktemp("caches"))
 
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory, caches) -> tuple[Path, str]:
-    """A checkout in which `make demo` was run once, and what that printed."""
+    """Run `make demo` in a checkout. Returns the checkout and the output."""
     checkout = copied_repository(tmp_path_factory.mktemp("demo") / "checkout")
     assert DEMO == "make demo\n"
     command = ["make", "demo", f"PYTHON={sys.executable}"]
@@ -107,7 +107,7 @@ def demo(tmp_path_factory, caches) -> tuple[Path, str]:
 
 @pytest.fixture(scope="module")
 def installed(demo) -> Path:
-    """The demo's environment, in which the README's wheel, built there too, took the checkout's place."""
+    """Install the README's wheel in the demo's environment, in place of the checkout. Returns its folder."""
     environment = demo[0] / ".venv-core"
     run([environment / "bin" / "python", "-m", "pip", "uninstall", "--yes", "stereoweave"], demo[0])
     checkout = copied_repository(demo[0].with_name("copy"))
@@ -149,7 +149,7 @@ def test_make_demo_takes_the_users_own_pair_and_installs_once(demo, pictures, ca
     assert not (checkout / "demo-out" / "depth.png").exists()
 
 
-def test_the_commands_run_from_the_wheel_in_an_environment_of_users(installed, pictures, caches):
+def test_the_commands_run_from_the_wheel_in_a_user_s_environment(installed, pictures, caches):
     assert "torch" not in packages_in(installed)
     path = f"{installed / 'bin'}:{os.environ['PATH']}"
     run(["bash", "-ec", COMMANDS], pictures, PATH=path, NUMBA_CACHE_DIR=caches)
@@ -160,18 +160,18 @@ def test_the_commands_run_from_the_wheel_in_an_environment_of_users(installed, p
     assert (pictures / "many" / "wall" / "disparity.pfm").is_file()
 
 
-def test_the_views_are_made_from_the_wheel_in_an_environment_of_users(installed, pictures, caches):
+def test_the_views_are_rendered_from_the_wheel_in_a_user_s_environment(installed, pictures, caches):
     path = f"{installed / 'bin'}:{os.environ['PATH']}"
     run(["bash", "-ec", VIEWS], pictures, PATH=path, NUMBA_CACHE_DIR=caches)
     assert read_image(pictures / "view.png").shape == (64, 96, 3)
     assert read_image(pictures / "quilt_qs8x6a1.5.png").shape == (6 * 64, 8 * 96, 3)
     with Image.open(pictures / "wiggle.webp") as wiggle:
-        # Of 12 frames those that are alike become one, which is shown for longer.
+        # Equal ones among the 12 frames are merged into one frame, which is shown for longer.
         shown_ms = [frame.info["duration"] for frame in ImageSequence.all_frames(wiggle)]
         assert sum(shown_ms) == 12 * ANIMATIONS["wiggle"].frame_ms
 
 
-def test_the_scores_of_own_scenes_run_from_the_wheel(installed, pictures, caches):
+def test_a_user_s_own_scenes_are_scored_from_the_wheel(installed, pictures, caches):
     command = "stereoweave bench pairs scenes -o rows.csv"
     assert f"{command}\n" in PAGES["docs/scores.md"]
     path = f"{installed / 'bin'}:{os.environ['PATH']}"
@@ -179,14 +179,14 @@ def test_the_scores_of_own_scenes_run_from_the_wheel(installed, pictures, caches
     assert (pictures / "rows.csv").is_file()
 
 
-def test_the_programs_run_from_the_wheel_in_an_environment_of_users(installed, pictures, caches):
+def test_the_programs_run_from_the_wheel_in_a_user_s_environment(installed, pictures, caches):
     for program in PROGRAMS:
         run([installed / "bin" / "python", "-c", program], pictures, NUMBA_CACHE_DIR=caches)
     assert len(PROGRAMS) == 2
     assert read_image(pictures / "view.png").shape == (64, 96, 3)
 
 
-def test_pictures_of_ones_own_go_through_the_commands_for_them(tmp_path):
+def test_the_commands_for_a_user_s_own_pictures_run(tmp_path):
     (tmp_path / "photographs").mkdir()
     for name in ("left.png", "right.png", "calib.txt"):
         shutil.copy(REPOSITORY / "examples" / name, tmp_path)
@@ -204,7 +204,7 @@ def test_pictures_of_ones_own_go_through_the_commands_for_them(tmp_path):
         assert (tmp_path / folder / "summary.csv").read_text().count("\n") == 2
 
 
-def test_videos_are_made_by_the_commands_for_them(pictures):
+def test_the_commands_for_videos_run(pictures):
     frame = read_image(pictures / "side_by_side.png")
     write_animation(pictures / "video_LR.mp4", [frame] * 3, frame_ms=40)
     run(["bash", "-ec", VIDEO], pictures, PATH=f"{Path(sys.executable).parent}:{os.environ['PATH']}")
@@ -212,7 +212,7 @@ def test_videos_are_made_by_the_commands_for_them(pictures):
     assert videos == ["anaglyph.mp4", "between.mp4", "depth.mkv", "depth.mp4", "video_LR.mp4"]
 
 
-def test_an_archive_is_worked_through_by_the_command_for_it(pictures):
+def test_the_command_for_an_archive_runs(pictures):
     (pictures / "scenes").rename(pictures / "pairs")
     printed = run(
         ["bash", "-ec", BATCH], pictures, PATH=f"{Path(sys.executable).parent}:{os.environ['PATH']}"
@@ -223,7 +223,7 @@ def test_an_archive_is_worked_through_by_the_command_for_it(pictures):
 
 
 @pytest.mark.needs_egl
-def test_synthetic_sets_are_made_and_checked_by_the_commands_for_them(tmp_path):
+def test_the_commands_for_synthetic_sets_run(tmp_path):
     path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
     printed = run(["bash", "-ec", SYNTHETIC], tmp_path, PATH=path)
     assert "4 pairs\n" in printed
@@ -233,7 +233,7 @@ def test_synthetic_sets_are_made_and_checked_by_the_commands_for_them(tmp_path):
     assert "ground truth" in (tmp_path / "views.csv").read_text()
 
 
-def test_two_trainings_are_resumed_and_scored_by_the_commands_for_researchers(tmp_path):
+def test_the_commands_for_researchers_resume_and_score_two_trainings(tmp_path):
     for name in ("quick", "quick_plain"):
         recipe = (REPOSITORY / "recipes" / "paper" / f"{name}.toml").read_text()
         for words, fewer in SHORTER.items():
@@ -242,7 +242,7 @@ def test_two_trainings_are_resumed_and_scored_by_the_commands_for_researchers(tm
         (tmp_path / "recipes" / "paper").mkdir(parents=True, exist_ok=True)
         (tmp_path / "recipes" / "paper" / f"{name}.toml").write_text(recipe)
     path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
-    # Threads would wait for each other most of the time, in pictures of this size.
+    # With pictures of this size, threads would mostly wait for each other.
     environment = {"PATH": path, "OMP_NUM_THREADS": "1"}
     run(["bash", "-ec", RESEARCH], tmp_path, **environment)
     written = (tmp_path / "runs" / "quick.csv").read_text()
@@ -250,7 +250,7 @@ def test_two_trainings_are_resumed_and_scored_by_the_commands_for_researchers(tm
     assert list(rows) == ["ground truth", "no warping", "sgbm", "median", "quick", "quick_plain"]
     assert rows["quick"]["epe_px"] != rows["quick_plain"]["epe_px"]
     finished = (tmp_path / "runs" / "quick" / "last.pt").stat().st_mtime_ns
-    # Started again with the same words, a training that is at its end has nothing left to do.
+    # Started again with the same command, a finished training has nothing left to do.
     run(["bash", "-ec", RESEARCH.splitlines()[0]], tmp_path, **environment)
     assert (tmp_path / "runs" / "quick" / "last.pt").stat().st_mtime_ns == finished
 
@@ -279,7 +279,7 @@ def test_the_index_links_to_each_page():
     assert sorted(page for page in pages if f"]({page})" not in index and f"(../{page})" not in index) == []
 
 
-def test_the_table_of_results_says_what_the_csv_says():
+def test_the_table_of_results_agrees_with_the_csv():
     measured = REPOSITORY / "results" / "pairs.csv"
     rows = csv.DictReader(measured.read_text().splitlines()) if measured.exists() else []
     decimals = {"epe_px": 2, "bad1_percent": 1, "bad2_percent": 1, "d1_percent": 1, "time_relative": 2}

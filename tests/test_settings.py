@@ -14,7 +14,7 @@ from stereoweave.cli.commands import option_names
 from stereoweave.cli.root import app
 from stereoweave.service.answers import field_name
 
-# What Ray Serve is warned of by Pydantic when it is imported.
+# A warning by Pydantic about Ray Serve when that is imported.
 pytestmark = pytest.mark.filterwarnings("ignore:Using extra keyword arguments on `Field`:DeprecationWarning")
 
 PACKAGE = Path(sw.__file__).parent
@@ -28,9 +28,9 @@ VARIABLE: dict[tuple[str, str], set[str]] = {
     ("video/job.py", "setting"): {"strength", "convergence_px"},
     ("video/job.py", "tuple(kinds)"): {"depth", "depth16", "position", "layout"},
 }
-# Rooms whose errors reach the page and the service.
+# Subpackages whose errors reach the page and the service.
 SHARED = {"cameras", "matching", "outputs", "pictures", "rendering"}
-# Settings of these rooms that the page and the service do not offer.
+# Settings of these subpackages that the page and the service do not offer.
 ABSENT = {
     "page": {
         *("convergence_px", "files", "forward", "layout", "left", "listed", "position", "provider"),
@@ -43,7 +43,7 @@ ABSENT = {
 
 
 def find_calls() -> Iterator[tuple[str, ast.Call]]:
-    """All calls in the package, with the module."""
+    """Yield all calls in the package, each with its module."""
     for path in sorted(PACKAGE.rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Call):
@@ -55,7 +55,7 @@ def is_remedy(call: ast.Call) -> bool:
 
 
 def find_settings() -> Iterator[tuple[str, str]]:
-    """Each setting that an error or a remedy names, with its module."""
+    """Yield each setting that an error or a remedy names, with its module."""
     for module, call in find_calls():
         values = [keyword.value for keyword in call.keywords if keyword.arg == "setting"]
         if is_remedy(call):
@@ -79,7 +79,7 @@ SHARED_SETTINGS = {setting for module, setting in SETTINGS if module.split("/")[
 def test_a_command_has_an_option_for_each_setting():
     options = [option_names(command) for command in list_commands(typer.main.get_command(app))]
     unknown = {name for _, name in SETTINGS if not any(option_of(name) for option_of in options)}
-    assert unknown == {"split"}  # of the recipes alone
+    assert unknown == {"split"}  # a setting of recipes only
 
 
 def test_the_service_has_a_field_for_each_setting_that_it_offers():
@@ -96,7 +96,7 @@ def find_strings(node: ast.AST) -> Iterator[str]:
             yield part.value
 
 
-def test_a_test_has_the_text_of_each_remedy():
+def test_each_remedy_s_text_is_in_a_test():
     sources = (path.read_text() for path in TESTS.rglob("*.py"))
     tested = "\n".join(re.sub(r"""["']\s+f?["']""", "", source) for source in sources)
     remedies = {part for _, call in find_calls() if is_remedy(call) for part in find_strings(call.args[0])}

@@ -68,7 +68,7 @@ def test_a_pair_refuses_pictures_of_two_sizes():
 
 @pytest.mark.usefixtures("without_shape_checks")
 @pytest.mark.parametrize("image", [np.zeros((32, 40, 3), np.float32), np.zeros((32, 40), np.uint8)])
-def test_a_pair_refuses_what_is_not_rgb_of_8_bits(image):
+def test_a_pair_refuses_images_that_are_not_8_bit_rgb(image):
     with pytest.raises(StereoweaveError, match="right image: expected uint8 RGB"):
         StereoPair(left=np.zeros((32, 40, 3), np.uint8), right=image)
 

@@ -1,4 +1,4 @@
-"""What ships: the network inside the package is the trained one, and as good as its card says."""
+"""The networks that ship in the package are the trained ones, and as accurate as promised."""
 
 import functools
 import json
@@ -28,7 +28,7 @@ from stereoweave.matching.options import MatchOptions
 ROOT = Path(__file__).parent.parent
 WEIGHTS = ROOT / "stereoweave/weights"
 CARDS = {name: json.loads((WEIGHTS / f"{name}.json").read_text()) for name in ("small", "base")}
-# Of no recipe, no validation and no calibration.
+# Not used by any recipe, validation or calibration.
 UNSEEN_SEED = 5_000_011
 
 
@@ -38,12 +38,12 @@ def test_the_shipped_networks_are_small_enough_to_ship(name, most_multiply_adds)
     assert CARDS[name]["multiply_adds_640x480"] <= most_multiply_adds
 
 
-def test_they_are_all_that_ships():
+def test_no_other_network_ships():
     assert shipped_models() == sorted(CARDS)
 
 
 @pytest.mark.parametrize("card", CARDS.values(), ids=CARDS)
-def test_the_card_names_its_origin_and_its_proofs(card):
+def test_the_card_gives_the_network_s_origin_and_measurements(card):
     assert card["licence"] == "Apache-2.0"
     assert re.fullmatch(r"[0-9a-f]{7,40}", card["commit"])
     assert card["hours"] > 0
@@ -52,7 +52,7 @@ def test_the_card_names_its_origin_and_its_proofs(card):
 
 
 @pytest.mark.parametrize("name", CARDS)
-def test_on_pairs_of_no_training_the_network_is_right_and_knows_where(name):
+def test_on_unseen_pairs_the_network_is_accurate_and_calibrated(name):
     errors_px, confidence = [], []
     for index in range(8):
         pair = paint_collage(UNSEEN_SEED, 0, index, 320, 512)
@@ -64,8 +64,8 @@ def test_on_pairs_of_no_training_the_network_is_right_and_knows_where(name):
     assert metrics.calibration_error(np.stack(confidence), within) < 0.1
 
 
-# The aim is half as many (lab notebook, 2026-11-21).
-def test_two_thirds_as_many_pixels_fly_as_with_bilinear_upsampling_from_a_quarter():
+# The target is half as many (lab notebook, 2026-11-21).
+def test_at_most_two_thirds_as_many_pixels_fly_as_with_bilinear_upsampling():
     network, flying_percents = trained("small"), []
     for index in range(8):
         pair = paint_collage(UNSEEN_SEED, 1, index, 320, 512)
@@ -83,9 +83,9 @@ def test_two_thirds_as_many_pixels_fly_as_with_bilinear_upsampling_from_a_quarte
 
 @functools.cache
 def found_raw(testdata, name):
-    """The real scenes, and what the network itself finds in each: all that `refined` does comes after it."""
+    """Return the real scenes, each with the network's raw estimate; `refined` applies only after it."""
     matcher, scenes = Matcher(name, threads=1), list(read_scenes(testdata / "stereo/pairs"))
-    # Whole, as `estimate` matches what a network can see at once.
+    # Each pair is matched whole, as `estimate` does if it fits into one pass.
     assert all(matcher.sees_whole(*scene.pair.left.shape[1::-1]) for scene in scenes)
     return [(scene, match(matcher, scene.pair, MatchOptions(raw=True))) for scene in scenes]
 
@@ -110,7 +110,7 @@ def test_on_real_pairs_the_network_is_as_good_as_promised(testdata, name, refine
 
 
 @pytest.mark.testdata
-# The aims are 29.2, 28.0 and 35.0 dB (lab notebook, 2026-11-21).
+# The targets are 29.2, 28.0 and 35.0 dB (lab notebook, 2026-11-21).
 @pytest.mark.parametrize(
     ("name", "scene_name", "least_db"),
     [
@@ -122,7 +122,7 @@ def test_on_real_pairs_the_network_is_as_good_as_promised(testdata, name, refine
         ("base", "venus", 34.2),
     ],
 )
-def test_new_views_come_near_to_real_photographs(testdata, name, scene_name, least_db):
+def test_new_views_are_close_to_real_pictures(testdata, name, scene_name, least_db):
     moved = runpy.run_path(str(testdata / "referee/score_views.py"))["moved"]
     scene = testdata / "stereo/views" / scene_name
     offsets = json.loads((scene / "scene.json").read_text()).get("offset_px", {})
@@ -138,10 +138,10 @@ def test_new_views_come_near_to_real_photographs(testdata, name, scene_name, lea
 
 @pytest.mark.testdata
 @pytest.mark.parametrize("name", CARDS)
-def test_on_real_pairs_the_shipped_file_answers_as_its_checkpoint_in_pytorch(testdata, name):
+def test_on_real_pairs_the_shipped_file_matches_its_checkpoint_in_pytorch(testdata, name):
     network, matcher = trained(name), Matcher(name, threads=1)
     for scene in read_scenes(testdata / "stereo/pairs"):
-        # Only of disparity: the confidence that ships was calibrated after training.
+        # Only disparity is compared: the shipped confidence was calibrated after training.
         difference_px, _ = compare_runtimes(network, matcher, scene.pair)
         assert difference_px < 0.01, scene.name
 

@@ -1,4 +1,4 @@
-"""Arguments of a wrong kind to every name of the Python interface: taken, or one line of our own error."""
+"""Every function of the Python interface accepts a wrong argument or refuses it with a one-line error."""
 
 import inspect
 import math
@@ -28,7 +28,7 @@ CAMERA = sw.StereoCamera(focal_px=100.0, baseline_m=0.1, cx_px=48.0, cy_px=32.0)
 
 
 def wrong_values() -> dict[str, Any]:
-    """Values that are right for no argument, or for few."""
+    """Return values that are wrong for all or most arguments."""
     return {
         "none": None,
         "true": True,
@@ -70,14 +70,14 @@ def wrong_values() -> dict[str, Any]:
 
 
 class Call:
-    """A call of the interface whose arguments are right, to be made with one of them wrong."""
+    """A call with valid arguments, which tests repeat with one argument replaced by a wrong one."""
 
     def __init__(self, name: str, call: Callable[..., Any], /, **right: Any) -> None:
         self.name, self.call, self.right = name, call, right
 
 
 def calls() -> list[Call]:
-    """All calls; each names its arguments by the words that callers may use."""
+    """Return calls of all functions, with keyword arguments."""
     matcher = sw.Matcher("small", threads=1)
     pair = {"left": LEFT, "right": RIGHT}
     maps = {name: getattr(FOUND, name) for name in ("disparity_px", "right_disparity_px")}
@@ -113,7 +113,7 @@ def calls() -> list[Call]:
 
 
 def outcome(call: Call, argument: str, value: Any) -> str | None:
-    """What is wrong with the answer to a wrong argument; None where nothing is."""
+    """Return what is wrong with the response to a wrong argument; None if the response is right."""
     try:
         call.call(**call.right | {argument: value})
     except StereoweaveError as error:
@@ -126,7 +126,7 @@ def outcome(call: Call, argument: str, value: Any) -> str | None:
 
 @pytest.mark.usefixtures("without_shape_checks")
 @pytest.mark.filterwarnings("ignore:the matrix subclass")
-def test_a_wrong_argument_is_one_line_of_our_own_error():
+def test_a_wrong_argument_is_a_one_line_stereoweave_error():
     wrong = []
     for call in calls():
         assert outcome(call, *next(iter(call.right.items()))) is None, call.name
@@ -137,7 +137,7 @@ def test_a_wrong_argument_is_one_line_of_our_own_error():
     assert not wrong, f"{len(wrong)}\n" + "\n".join(wrong)
 
 
-def test_every_argument_of_the_interface_is_tried():
+def test_every_argument_of_the_interface_is_tested():
     tried = {call.name.split(" ")[0]: set(call.right) for call in calls()}
     for call in calls():
         tried[call.name.split(" ")[0]] |= set(call.right)
