@@ -14,7 +14,6 @@ from jaxtyping import Float
 
 from stereoweave.bench.edge_metrics import edge_bad_percent, edge_epe_px, flying_percent
 from stereoweave.bench.error_classes import class_errors, classify
-from stereoweave.bench.memory import peak_memory_mb
 from stereoweave.bench.metrics import (
     bad_percent,
     calibration_error,
@@ -40,6 +39,7 @@ from stereoweave.matching.estimate import match
 from stereoweave.matching.options import MatchOptions
 from stereoweave.matching.providers import CPU
 from stereoweave.stereo import Estimate, StereoPair
+from stereoweave.system.memory import peak_memory_mb
 from stereoweave.system.ray_engine import Engine, stream
 
 MatchFunction = Callable[[StereoPair], Estimate | Float[np.ndarray, "h w"]]

@@ -4,7 +4,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from stereoweave.bench.memory import peak_memory_mb
+from stereoweave.system.memory import peak_memory_mb
 
 # Makes a function that returns as many bytes as requested, all of them written.
 BYTES = partial(partial, operator.mul, b"x")
