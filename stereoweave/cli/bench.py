@@ -39,6 +39,30 @@ Classes = Annotated[
         "near edges, plain, weakly textured, textured).",
     ),
 ]
+ScenesFolder = Annotated[
+    Path,
+    typer.Argument(
+        help="Folder with a subfolder per scene, which contains left.png, right.png and disparity.png; "
+        "or a set made by synth make."
+    ),
+]
+Dataset = Annotated[
+    str | None,
+    typer.Option(
+        help="Public dataset that the folder contains, unpacked as its authors distribute it. An unknown "
+        "name lists them all."
+    ),
+]
+Plot = Annotated[
+    Path | None, typer.Option(help="Picture to write: errors against time. Needs the extra 'train'.")
+]
+SparsificationPlot = Annotated[
+    Path | None,
+    typer.Option(
+        help="Picture to write: errors of the pixels that remain as the least confident ones are dropped. "
+        "Needs the extra 'train'."
+    ),
+]
 CsvFile = Annotated[Path, typer.Option("--out", "-o", help="CSV file to write.")]
 Models = Annotated[
     list[str] | None,
@@ -50,34 +74,12 @@ bench = Commands("Score matchers, new views, videos and trained networks.")
 
 @bench.command()
 def pairs(  # noqa: PLR0913 - each is an option of the command line
-    folder: Annotated[
-        Path,
-        typer.Argument(
-            help="Folder with a subfolder per scene, which contains left.png, right.png and disparity.png; "
-            "or a "
-            "set made by synth make."
-        ),
-    ],
+    folder: ScenesFolder,
     out: CsvFile = Path("pairs.csv"),
     model: Models = None,
-    dataset: Annotated[
-        str | None,
-        typer.Option(
-            help="Public dataset that the folder contains, unpacked as its authors distribute it. An unknown "
-            "name lists them all."
-        ),
-    ] = None,
-    plot: Annotated[
-        Path | None, typer.Option(help="Picture to write: errors against time. Needs the extra 'train'.")
-    ] = None,
-    sparsification: Annotated[
-        Path | None,
-        typer.Option(
-            help="Picture to write: errors of the pixels that remain as the least confident ones are "
-            "dropped. "
-            "Needs the extra 'train'."
-        ),
-    ] = None,
+    dataset: Dataset = None,
+    plot: Plot = None,
+    sparsification: SparsificationPlot = None,
     classes: Classes = None,
     cluster: Cluster = None,
     threads: Threads = None,

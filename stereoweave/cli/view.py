@@ -104,35 +104,27 @@ def view(  # noqa: PLR0913 - each is an option of the command line
     from stereoweave.matching.estimate import match
     from stereoweave.matching.options import MatchOptions
     from stereoweave.pictures.prepare import prepare
-    from stereoweave.rendering.layouts import (
-        LAYOUTS,
-        add_mark,
-        check_positions,
-        choose_layout,
-        median_disparity_px,
-    )
+    from stereoweave.rendering import layouts
     from stereoweave.rendering.renderer import Renderer, check_position
 
-    name = choose_layout(out, layout)
+    name = layouts.choose_layout(out, layout)
     _check_unused(name, {"--position": position, "--up": up or None, "--forward": forward or None}, quilt)
-    if name == "rgbd" and (strength != 1 or convergence is not None):
-        raise StereoweaveError(
-            "--strength, --convergence: expected with a layout of several views, found with rgbd"
-        )
+    if strength != 1 or convergence is not None:
+        _check_has_views(name)
     check_position(_MIDDLE, up=up, forward=forward)
     layout_options = _parse_quilt(quilt)
     positions, converged = _view_positions(name, _MIDDLE if position is None else position)
-    check_positions(positions, strength)
+    layouts.check_positions(positions, strength)
     plane_px = _parse_convergence_px(("auto" if converged else "0") if convergence is None else convergence)
     options = MatchOptions(range_px=parse_range_px(range_px), refined=True)
     prepared = prepare(pictures, make_request(format, calib, rectify=rectify))
     pair = crop(prepared.pair)
-    if name in LAYOUTS:
-        out = add_mark(out, name, pair, layout_options)
+    if name in layouts.LAYOUTS:
+        out = layouts.add_mark(out, name, pair, layout_options)
     make_parent_folder(out)
     estimate = match(Backend(model=model, threads=threads, provider=provider).matcher(), pair, options)
     if plane_px is None:
-        plane_px = median_disparity_px(estimate)
+        plane_px = layouts.median_disparity_px(estimate)
     renderer = Renderer(pair, estimate, strength=strength, convergence_px=plane_px, threads=threads)
     if name is None:
         written = _write_view(out, renderer.view(*positions, up=up, forward=forward), *positions)
@@ -154,6 +146,14 @@ def _check_unused(name: str | None, single_view: dict[str, float | None], quilt:
     if name != "quilt" and quilt is not None:
         raise StereoweaveError(
             f"--quilt: expected only with --layout quilt, found with {name or 'a single view'}"
+        )
+
+
+def _check_has_views(name: str | None) -> None:
+    """Raise a StereoweaveError if the layout has no views that strength and convergence could shift."""
+    if name == "rgbd":
+        raise StereoweaveError(
+            "--strength, --convergence: expected with a layout of several views, found with rgbd"
         )
 
 
