@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stereoweave.errors import StereoweaveError, require_extra
+from stereoweave.errors import StereoweaveError, reason, require_extra
 
 if TYPE_CHECKING:
     from stereoweave.pictures.prepare import Request
@@ -204,9 +204,10 @@ def listen(host: str, port: int) -> socket.socket:
         family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         return socket.create_server(address[:2], family=family)
     except OSError as error:
+        # create_server appends the address to the system's text.
+        found = reason(error).partition(" (while attempting")[0]
         raise StereoweaveError(
-            f"--host {host} --port {port}: expected a free address, found {str(error).lower()}; "
-            "--port 0 takes any free port"
+            f"--host {host} --port {port}: expected a free address, found {found}; --port 0 takes any free port"
         ) from error
 
 

@@ -20,7 +20,7 @@ from stereoweave.cli.options import (
     format_url,
     listen,
 )
-from stereoweave.errors import StereoweaveError, require_extra
+from stereoweave.errors import StereoweaveError, reason, require_extra
 from stereoweave.system.ray_engine import set_environment
 from stereoweave.system.threads import usable_cores
 
@@ -148,7 +148,9 @@ def _read_token(path: Path) -> str:
     try:
         token = path.read_text(encoding="ascii").strip()
     except (OSError, UnicodeDecodeError) as error:
-        raise StereoweaveError(f"--token-file {path}: expected a file with a token, found {error}") from error
+        raise StereoweaveError(
+            f"--token-file {path}: expected a file with a token, found {reason(error)}"
+        ) from error
     if not re.fullmatch(_TOKEN, token):
         found = "other characters" if token else "nothing"
         raise StereoweaveError(
