@@ -61,7 +61,7 @@ def list_view_scenes(folder: str | Path) -> list[Callable[[], ViewScene]]:
     also have disparity.png (16 bits, pixels * 256, 0 = unknown) or disparity.pfm (NaN or infinity = unknown),
     and right_disparity in the same formats. An optional scene.json gives each picture's offset from its
     nominal place as "offset_px": {position: [right, down]}. Without such folders, the scenes are the pairs of
-    all rendered sets (`stereoweave synth make --view`) in and below `folder`.
+    all rendered sets (`stereoweave synth make`) in and below `folder`.
 
     Raises:
         StereoweaveError: If the folder contains no scene.
@@ -76,7 +76,7 @@ def list_view_scenes(folder: str | Path) -> list[Callable[[], ViewScene]]:
     if not sets:
         raise StereoweaveError(
             f"{root}: expected <scene>/left.png below it, or rendered sets, found neither; "
-            "render a set with further views: stereoweave synth make --view"
+            "render a set with further views: stereoweave synth make"
         )
     return [
         partial(_read_rendered_scene, pairs, index, root) for pairs in sets for index in range(pairs.count)
@@ -90,7 +90,7 @@ def _read_rendered_scene(pairs: Shards, index: int, root: Path) -> ViewScene:
     if not views:
         raise FormatError(
             f"{folder}: expected further views of every pair, found none of {name}; "
-            "render a set with further views: stereoweave synth make --view"
+            "render a set with further views: stereoweave synth make"
         )
     return ViewScene(name=name, sample=pairs[index], views=views)
 

@@ -207,7 +207,8 @@ def listen(host: str, port: int) -> socket.socket:
         # create_server appends the address to the system's text.
         found = reason(error).partition(" (while attempting")[0]
         raise StereoweaveError(
-            f"--host {host} --port {port}: expected a free address, found {found}; --port 0 takes any free port"
+            f"--host {host} --port {port}: expected a free address, found {found}; "
+            "--port 0 takes any free port"
         ) from error
 
 

@@ -256,7 +256,7 @@ def test_a_body_is_checked_for_every_method(page, method):
     assert (answer.status_code, answer.text) == REFUSED
 
 
-@pytest.mark.no_cover  # coverage would slow it down
+@pytest.mark.usefixtures("untraced")
 def test_a_long_cookie_of_another_server_does_not_delay_the_page(page):
     other = (
         'other="' + r"\a" * 30_000 + '"'

@@ -279,13 +279,15 @@ def test_another_job_or_an_unrelated_folder_is_refused_before_processing_starts(
     calibration.write_text("first")
     job = DepthJob(request=Request(calibration=calibration))
     assert run_quietly(folder, out, job, pairs=[])[0] == LocalTally(done=0, skipped=0, failed=())
-    with pytest.raises(StereoweaveError, match='batch.json: expected model = "base", .* found "small"'):
+    with pytest.raises(
+        StereoweaveError, match='batch.json: expected model = "base" for this run, found "small"'
+    ):
         run_quietly(
             folder, out, DepthJob(request=Request(calibration=calibration), backend=Backend(model="base"))
         )
     calibration.write_text("second")
     with pytest.raises(
-        StereoweaveError, match=r"expected calibration = .calib.txt \w{12}., .* another folder"
+        StereoweaveError, match=r"calibration = .calib.txt \w{12}. for this run, .* another folder"
     ):
         run_quietly(folder, out, job)
     with pytest.raises(

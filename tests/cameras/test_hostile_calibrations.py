@@ -47,7 +47,7 @@ def refusal(path):
     return message
 
 
-@pytest.mark.no_cover  # which takes time
+@pytest.mark.usefixtures("untraced")
 @pytest.mark.parametrize("name", HOSTILE)
 def test_a_hostile_calibration_is_refused_at_once_in_one_short_line(name, tmp_path):
     (tmp_path / "calib").write_bytes(HOSTILE[name])

@@ -60,7 +60,7 @@ def test_the_network_is_loaded_with_the_settings_of_the_backend():
             "none.onnx: expected an ONNX matcher file, found no such file",
         ),
         ({"provider": "abacus"}, MatcherError, "provider: expected one of cpu, "),
-        ({"threads": 0}, StereoweaveError, "threads: expected 1 or more"),
+        ({"threads": 0}, StereoweaveError, "threads: expected a number from 1 to 1024, got 0"),
     ],
 )
 def test_a_failure_to_load_is_a_one_line_error(fields, kind, message):

@@ -66,7 +66,6 @@ def test_endless_headers_are_refused_before_they_fill_memory(address, connection
         assert read_to_end(other).startswith(b"HTTP/1.1 200")
 
 
-@pytest.mark.no_cover  # measuring coverage slows it down
 @pytest.mark.parametrize("begun", [b"", HEAD + b"X: "])
 def test_headers_that_do_not_arrive_in_time_close_the_connection(connection, begun):
     start_s = time.monotonic()
@@ -140,7 +139,6 @@ def test_accepted_requests_are_answered_before_the_server_ends():
             assert read_to_end(connection).endswith(b"later")
 
 
-@pytest.mark.no_cover  # measuring coverage slows it down
 def test_a_body_of_tiny_chunks_does_not_delay_other_requests(address, connection):
     connection.sendall(b"POST /5 HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\n")
     threading.Thread(target=connection.sendall, args=(b"1\r\na\r\n" * 150_000,), daemon=True).start()

@@ -181,7 +181,7 @@ def test_a_damaged_shard_is_reported_once_for_all_of_its_pairs(folder):
     found = checked(folder)
     count = 1 if next(folder.glob("*.tar"), None) else 3
     assert len(found.problems) == count
-    assert all("and the same stereoweave synth make makes" in message for message in found.problems)
+    assert all("rerun the same `stereoweave synth make` command" in message for message in found.problems)
     assert list(report_lines(found))[-1] == f"{count} problem{'s' * (count > 1)}"
 
 
