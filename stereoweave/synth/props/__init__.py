@@ -1,1 +1,1 @@
-"""Objects that scenes are composed of."""
+"""Objects used to compose scenes."""

@@ -1,4 +1,4 @@
-"""Antennas of several kinds, mounted at the origin. Directional ones point along +x."""
+"""Antennas of several kinds, mounted at the origin. Directional antennas point along +x."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ FORWARD = rotation((0, 1, 0), 90)  # rotates z onto x
 
 
 def panel(height_m: float, cover: int, steel: int) -> Mesh:
-    """Build a sector panel in front of its pole, with brackets, radio unit and cables."""
+    """Build a sector antenna to mount in front of a pole, with brackets, a radio unit and cables."""
     half = height_m / 2
     brackets = np.array([[(-0.08, 0, z), (0.03, 0, z)] for z in (-0.7 * half, 0.7 * half)])
     leads = np.array(
@@ -34,7 +34,7 @@ def panel(height_m: float, cover: int, steel: int) -> Mesh:
 
 
 def drum(radius_m: float, cover: int, steel: int) -> Mesh:
-    """Build a shrouded microwave dish with a bulging cover, on a bracket."""
+    """Build a shrouded microwave dish with a bulging cover and a bracket."""
     r, depth = radius_m, 0.75 * radius_m
     profile = np.array(
         [
@@ -96,7 +96,7 @@ def satellite_dish(radius_m: float, cover: int, steel: int) -> Mesh:
 
 
 def yagi(length_m: float, count: int, steel: int, end: int) -> Mesh:
-    """Build a Yagi antenna with a loop dipole and a reflector of rods.
+    """Build a Yagi antenna with a folded dipole and a reflector of rods.
 
     The directors get shorter towards the front.
     """
@@ -124,7 +124,7 @@ def yagi(length_m: float, count: int, steel: int, end: int) -> Mesh:
 
 
 def whip(height_m: float, cover: int, steel: int) -> Mesh:
-    """Build a whip antenna, an upright rod, on a short mount."""
+    """Build a whip antenna: an upright rod on a short mount."""
     return join_meshes(
         [
             tubes((0, 0, 0), (0, 0, height_m), np.array([[0.014, 0.007]]), cover, 8),
@@ -135,7 +135,7 @@ def whip(height_m: float, cover: int, steel: int) -> Mesh:
 
 
 def dipoles(count: int, steel: int) -> Mesh:
-    """Build a column of loop dipoles on a pole."""
+    """Build a column of folded dipoles on a pole."""
     angle = np.linspace(0, 2 * np.pi, 13)
     loop = np.column_stack([0.14 + 0.03 * np.cos(angle), 0 * angle, 0.15 * np.sin(angle)])
     z = (np.arange(count) * 0.42)[:, None, None] * [0.0, 0, 1]

@@ -1,4 +1,7 @@
-"""Common parts of bridges (road, piers, railings, lamps), and stone arch bridges. The road runs along x."""
+"""Stone arch bridges, and the parts common to all bridges: roads, piers, railings and lamps.
+
+The road runs along x.
+"""
 
 from dataclasses import dataclass
 
@@ -40,7 +43,7 @@ class BridgePlan:
         level_m: height of the road above the water.
         half_m: half the length of the road between the banks.
         width_m: width of the road.
-        steel, masonry, dressed, asphalt, rail: materials; dressed stone lines the edges.
+        steel, masonry, dressed, asphalt, rail: materials; `dressed` is used for edge stones.
     """
 
     level_m: float
@@ -59,7 +62,7 @@ class BridgePlan:
 
 
 def draw_bridge_plan(rng: np.random.Generator, palette: Palette) -> BridgePlan:
-    """Draw a bridge plan and add its materials to the palette."""
+    """Draw a random bridge plan and add its materials to the palette."""
     paint = _STEEL_PAINTS[rng.integers(len(_STEEL_PAINTS))]
     masonry = Material(
         texture=str(rng.choice(["stone", "brick", "concrete"], p=[0.5, 0.15, 0.35])),
@@ -91,9 +94,9 @@ def draw_bridge_plan(rng: np.random.Generator, palette: Palette) -> BridgePlan:
 
 
 def beams(starts_m: Numbers, ends_m: Numbers, size_m: tuple[float, float], material: int) -> Mesh:
-    """Build rectangular bars [N] from start to end.
+    """Build rectangular bars [N] between pairs of points.
 
-    size_m: horizontal and vertical size of a horizontal bar's cross-section.
+    size_m: width and height of the cross-section of a horizontal bar.
     """
     starts, ends = np.broadcast_arrays(np.atleast_2d(starts_m), np.atleast_2d(ends_m))
     along = ends - starts
@@ -105,7 +108,7 @@ def beams(starts_m: Numbers, ends_m: Numbers, size_m: tuple[float, float], mater
 
 
 def roadway(plan: BridgePlan, start_m: float, end_m: float, *, deep_m: float = 0.1) -> Mesh:
-    """Build slab, asphalt, kerbs and railings from x = start_m to x = end_m, with the road at z = 0."""
+    """Build the slab, asphalt, kerbs and railings from x = start_m to x = end_m, with the road at z = 0."""
     middle_m, length_m = (start_m + end_m) / 2, end_m - start_m
     slab = boxes([[middle_m, 0, -deep_m / 2 - 0.01]], [[length_m, plan.width_m, deep_m]], plan.masonry)
     asphalt = boxes([[middle_m, 0, -0.005]], [[length_m, 0.74 * plan.width_m, 0.03]], plan.asphalt)
@@ -135,7 +138,10 @@ def street_lamps(plan: BridgePlan, start_m: float, end_m: float, material: int, 
 
 
 def pier(plan: BridgePlan, at_m: float, top_m: float, *, thick_m: float = 0.32, wide_m: float = 0.3) -> Mesh:
-    """Build a river pier with pointed ends, wide_m wider than the road and topped at z = top_m."""
+    """Build a river pier with pointed ends and its top at z = top_m.
+
+    Without its pointed ends, the pier is wide_m wider than the road.
+    """
     y = plan.width_m / 2 + wide_m / 2
     outline = np.array([(0.5, -y), (0.5, y), (0, y + 0.2), (-0.5, y), (-0.5, -y), (0, -y - 0.2)]) * [
         thick_m,
@@ -148,7 +154,7 @@ def pier(plan: BridgePlan, at_m: float, top_m: float, *, thick_m: float = 0.32, 
 
 
 def abutments(plan: BridgePlan) -> Mesh:
-    """Build the abutments between bridge and banks at both ends."""
+    """Build the abutments between the bridge and the banks at both ends."""
     size_m = [0.9, plan.width_m + 0.24, plan.level_m + 0.88]
     x = (plan.half_m + 0.42) * np.array([-1.0, 1.0])
     walls = boxes([[at, 0, (plan.level_m - 1.12) / 2] for at in x], [size_m], plan.masonry)
@@ -187,7 +193,7 @@ def stone_arch_bridge(rng: np.random.Generator, palette: Palette, plan: BridgePl
 
 
 def _arch(plan: BridgePlan, arch_m: Float[np.ndarray, "k 2"], reach_m: float) -> Mesh:
-    """Build one arch and the wall above it: faces on both sides, vault and voussoirs."""
+    """Build one arch and the wall above it: the faces on both sides, the vault and the voussoirs."""
     y, top_m = plan.width_m / 2, plan.level_m
     below = np.concatenate(
         [[[-reach_m, -0.7], [arch_m[0, 0], -0.7]], arch_m, [[arch_m[-1, 0], -0.7], [reach_m, -0.7]]]

@@ -1,4 +1,4 @@
-"""Building site around a tower crane: concrete shell, scaffolding, site offices, hoarding and a town."""
+"""Building sites with a concrete shell, scaffolding, site offices, a hoarding and a town."""
 
 import numpy as np
 
@@ -8,12 +8,12 @@ from stereoweave.synth.props.surroundings import draw_spots, hills, houses, pall
 from stereoweave.synth.stage import Palette
 from stereoweave.synth.world import Colour, Material, Mesh, join_meshes
 
-SCALE = 0.4  # scale of the surroundings, because the crane is smaller than a real one
+SCALE = 0.4  # scale of the surroundings, which matches the reduced size of the crane
 BAY_M, STOREY_M = 0.95, 0.52
 
 
 def building_site(rng: np.random.Generator, palette: Palette) -> Mesh:
-    """Build a site whose shell is at negative y, behind a crane that is seen from positive y."""
+    """Build a site with its concrete shell at negative y, behind a crane seen from positive y."""
     small = np.diag([SCALE, SCALE, SCALE, 1.0])
     town = draw_spots(rng, 20, 17 / SCALE, 60 / SCALE)
     stacks = draw_spots(rng, 7, 2 / SCALE, 5 / SCALE)
@@ -43,7 +43,7 @@ def _yard(rng: np.random.Generator, palette: Palette) -> Mesh:
 def _shell(rng: np.random.Generator, palette: Palette) -> Mesh:
     """Build a concrete shell under construction.
 
-    Its slabs stand on columns around a core, with starter bars, props, railings and scaffolding.
+    The shell has a core, slabs on columns, starter bars, props, railings and scaffolding.
     """
     concrete = palette.add(
         Material(texture="concrete", variant=int(rng.integers(8)), span_m=1.6, roughness=0.9)
@@ -77,20 +77,20 @@ def _shell(rng: np.random.Generator, palette: Palette) -> Mesh:
 
 
 def _starters(tops: np.ndarray) -> np.ndarray:
-    """Return segments [N, 2, 3] of the starter bars on top of the columns."""
+    """Return the starter bars on top of the columns as segments [N, 2, 3]."""
     around = np.array([(a, b, 0.0) for a in (-0.035, 0.0, 0.035) for b in (-0.035, 0.035)])
     feet = (tops[:, None] + around).reshape(-1, 3)
     return np.stack([feet, feet + [0, 0, 0.36]], 1)
 
 
 def _props(rng: np.random.Generator, x: np.ndarray, y: np.ndarray, floor_m: float) -> np.ndarray:
-    """Return segments [N, 2, 3] of the props below the highest slab."""
+    """Return the props below the highest slab as segments [N, 2, 3]."""
     at = rng.uniform((x[0], y[0], 0), (x[-1], y[-1], 0), (40, 3)) + [0, 0, floor_m]
     return np.stack([at, at + [0, 0, STOREY_M - 0.07]], 1)
 
 
 def _scaffolding(size_m: np.ndarray, floors: int, tube: int, board: int) -> Mesh:
-    """Build standards, ledgers, braces and planks in front of the visible side."""
+    """Build scaffolding with standards, ledgers, braces and planks in front of the visible side."""
     x = np.linspace(-size_m[0] / 2, 0.1 * size_m[0], 6)
     y = size_m[1] / 2 + np.array([0.06, 0.3])
     z = np.arange(0, floors + 1) * STOREY_M

@@ -9,7 +9,7 @@ from stereoweave.synth.world import Mesh, join_meshes
 
 
 def suspension_bridge(rng: np.random.Generator, palette: Palette, plan: BridgePlan) -> Mesh:
-    """Build a suspension bridge: two towers, main cables to both banks, hangers and a stiffening girder."""
+    """Build a suspension bridge with two towers, cables to both banks, hangers and a stiffening girder."""
     tower_m, top_m = rng.uniform(2.2, 2.6), plan.level_m + rng.uniform(1.35, 1.9)
     low_m, anchor_m = plan.level_m + 0.14, plan.half_m + 0.5
     masonry_towers = rng.random() < 0.35
@@ -31,7 +31,7 @@ def suspension_bridge(rng: np.random.Generator, palette: Palette, plan: BridgePl
 
 
 def cable_stayed_bridge(rng: np.random.Generator, palette: Palette, plan: BridgePlan) -> Mesh:
-    """Build a cable-stayed bridge with one or two towers and straight stays to the road's edges."""
+    """Build a cable-stayed bridge with one or two towers and straight stays to the edges of the road."""
     single = rng.random() < 0.5
     towers_m = [rng.uniform(-0.4, 0.4)] if single else [-0.5 * plan.half_m, 0.5 * plan.half_m]
     top_m = plan.level_m + (rng.uniform(2.4, 3.0) if single else rng.uniform(1.5, 1.9))
@@ -63,7 +63,7 @@ def cable_stayed_bridge(rng: np.random.Generator, palette: Palette, plan: Bridge
 
 
 def _girder(plan: BridgePlan) -> Mesh:
-    """Build a low truss along each edge, under the road."""
+    """Build a shallow truss under each edge of the road, with cross beams between the two."""
     x = np.linspace(-plan.half_m, plan.half_m, 45)
     parts = []
     for y in (-plan.side_m, plan.side_m):
@@ -76,7 +76,7 @@ def _girder(plan: BridgePlan) -> Mesh:
 
 
 def _hangers(plan: BridgePlan, cable: np.ndarray) -> Mesh:
-    """Build vertical rods from the cable to the girder, evenly spaced along the road."""
+    """Build hangers from the cable to the girder, evenly spaced along the road."""
     x = np.arange(-plan.half_m + 0.12, plan.half_m - 0.1, 0.15)
     tops = np.stack([x, np.full(len(x), cable[0, 1]), np.interp(x, cable[:, 0], cable[:, 2])], -1)
     feet = tops * [1, 1, 0] + [0, 0, plan.level_m - 0.02]
@@ -93,7 +93,7 @@ def _anchors(plan: BridgePlan, at_m: float) -> Mesh:
 
 
 def _portal(plan: BridgePlan, top_m: float, thick_m: float, material: int, crossings: int) -> Mesh:
-    """Build two tapering legs beside the road, with a cross beam below the road and `crossings` above it."""
+    """Build two tapering legs beside the road, one cross beam below it and `crossings` beams above it."""
     y = plan.side_m + 0.04 + thick_m / 2
     legs = [_leg((0, side * (y + 0.06), 0.2), (0, side * y, top_m), thick_m, material) for side in (-1, 1)]
     heights = [plan.level_m - 0.22, *np.linspace(top_m - 0.1, plan.level_m + 0.85, crossings)]
@@ -118,7 +118,7 @@ def _fork_m(plan: BridgePlan, top_m: float) -> float:
 
 
 def _inset(plan: BridgePlan, z: np.ndarray, top_m: float) -> np.ndarray:
-    """Return the distances from the axis at which cables meet an inverted Y tower at heights z."""
+    """Return the distances from the axis at which cables meet an inverted-Y tower at the heights z."""
     fork_m = _fork_m(plan, top_m)
     return 0.05 + np.clip((fork_m - z) / (fork_m - 0.2), 0, 1) * (plan.side_m + 0.25)
 

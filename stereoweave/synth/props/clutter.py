@@ -1,4 +1,4 @@
-"""Clutter: many objects in the cameras' field of view, near and far, standing and floating."""
+"""Clutter: many near and far objects, standing or floating, in the cameras' field of view."""
 
 from dataclasses import dataclass, replace
 
@@ -17,24 +17,24 @@ from stereoweave.synth.world import Mesh
 COUNT = (15, 40)
 _SIZES_M = (0.05, 1.5)
 _NEAREST_M = 0.75
-# Object size as a share of distance, so that objects look equally large at all depths.
+# Object size as a fraction of the distance, so that objects look equally large at all depths.
 _SIZE_PER_DISTANCE = (0.05, 0.55)
 _TYPICAL_FOCAL_PX = 600
 _THIN_PX = (1.0, 6.0)
 _CANDIDATES = 24
-_CLEAR_M = 0.6  # least gap between a camera and an object
+_CLEAR_M = 0.6  # smallest gap between a camera and an object
 
 
 @dataclass(frozen=True, kw_only=True)
 class ClutterSpace:
-    """Space that clutter fills.
+    """Space to fill with clutter.
 
     Attributes:
-        orbit: the viewpoints; objects keep clear of all of them.
+        orbit: orbit of the cameras; objects keep clear of all viewpoints on it.
         low_m, high_m: [3], corners of the box that contains the objects; the floor is at low_m[2].
-        far_m: largest distance between cameras and objects.
+        far_m: largest distance between a camera and an object.
         count: minimum and maximum number of objects.
-        standing: share of objects that stand on the floor.
+        standing: fraction of the objects that stand on the floor.
     """
 
     orbit: Orbit
@@ -45,7 +45,7 @@ class ClutterSpace:
     standing: float = 0.4
 
     def eyes_m(self) -> Float[np.ndarray, "n 3"]:
-        """Return camera positions [N, 3] sampled all over the orbit."""
+        """Return camera positions [N, 3] sampled over the whole orbit."""
         orbit = self.orbit
         ranges = (orbit.distance_m, orbit.azimuth_deg, orbit.elevation_deg)
         grids = np.meshgrid(*(np.linspace(start, end, 3) for start, end in ranges))
@@ -76,7 +76,10 @@ class _ClutterPlacement:
 
 
 def clutter(rng: np.random.Generator, palette: Palette, space: ClutterSpace) -> list[Mesh]:
-    """Draw objects of 5 cm to 1.5 m; in half of the draws, many of them are only 1 to 6 px thick."""
+    """Build random objects, 5 cm to 1.5 m in size.
+
+    In half of all scenes, a quarter to half of the objects are thin, with bars 1 to 6 px thick.
+    """
     count = int(rng.integers(space.count[0], space.count[1] + 1))
     thin_share = rng.uniform(0.25, 0.5) if rng.random() < 0.5 else 0.0
     bars_px = _log_uniform(rng, *_THIN_PX, (count,))
@@ -95,7 +98,7 @@ def _log_uniform(rng: np.random.Generator, low: float, high: float, shape: tuple
 
 
 def _draw_kind(rng: np.random.Generator, thin_share: float) -> PropBuilder:
-    """Draw a kind of object, which is thin with probability `thin_share`."""
+    """Draw a random kind of object; with probability `thin_share`, the object is thin."""
     others = SOLIDS if rng.random() < 0.65 else FURNITURE
     kinds = THIN if rng.random() < thin_share else others
     return kinds[rng.integers(len(kinds))]
@@ -104,8 +107,8 @@ def _draw_kind(rng: np.random.Generator, thin_share: float) -> PropBuilder:
 def _draw_placements(rng: np.random.Generator, space: ClutterSpace, count: int) -> list[_ClutterPlacement]:
     """Place objects in order of decreasing apparent size.
 
-    Each object takes the best of several candidate positions. Clearance from all cameras comes before
-    clearance from other objects, and objects too close to a camera are shrunk.
+    Each object takes the best of several candidate positions; clearance from the cameras matters more than
+    clearance from other objects. Objects too close to a camera are shrunk.
     """
     eyes_m = space.eyes_m()
     shape = (count, _CANDIDATES)
@@ -142,12 +145,12 @@ def _points_in_view(
     eyes_m: Float[np.ndarray, "n k 3"],
     depths_m: Float[np.ndarray, "n k"],
 ) -> Float[np.ndarray, "n k 3"]:
-    """Draw points [N, K, 3] in the field of view of cameras that look at the orbit's centre."""
+    """Draw points [N, K, 3] in the fields of view of cameras that look at the orbit's centre."""
     forward = np.array(space.orbit.centre_m) - eyes_m
     forward /= np.linalg.norm(forward, axis=-1, keepdims=True)
     right = np.cross(forward, [0, 0, 1])
     right /= np.linalg.norm(right, axis=-1, keepdims=True)
-    # Focal lengths are drawn later, so the points cover narrow and wide fields of view alike.
+    # Focal lengths are drawn later, so the points cover both narrow and wide fields of view.
     reach = rng.uniform(0.25, 0.6, depths_m.shape)
     x, y = reach * rng.uniform(-1, 1, depths_m.shape), 0.75 * reach * rng.uniform(-1, 1, depths_m.shape)
     seen = forward + x[..., None] * right + y[..., None] * np.cross(right, forward)
@@ -155,7 +158,10 @@ def _points_in_view(
 
 
 def _place_mesh(rng: np.random.Generator, mesh: Mesh, place: _ClutterPlacement, floor_m: float) -> Mesh:
-    """Rotate and scale a mesh and its texture, then move it to its position or onto the floor below."""
+    """Rotate and scale a mesh with its texture, and move it to its position.
+
+    Standing objects are moved onto the floor.
+    """
     low, high = mesh.corners_m.min((0, 1)), mesh.corners_m.max((0, 1))
     scale = place.size_m / float((high - low).max())
     axis = np.array([0, 0, 1]) if place.standing else rng.normal(size=3)

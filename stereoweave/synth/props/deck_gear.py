@@ -1,6 +1,6 @@
-"""Deck gear of ships, such as winches, nets, derricks, containers and boats. The bow is at +x.
+"""Deck gear for ships, such as winches, nets, derricks, containers and boats. The bow is at +x.
 
-`at_m` is the position of the gear on deck.
+`at_m` is the position of the gear on the deck.
 """
 
 import numpy as np
@@ -25,7 +25,7 @@ from stereoweave.synth.world import Mesh, join_meshes
 
 
 def winch(at_m: Point, width_m: float, materials: ShipMaterials, load: int) -> Mesh:
-    """Build a transverse drum, full of rope or net, between cheeks on a bed."""
+    """Build a winch on a bed: a transverse drum, wound with rope or net, between two cheeks."""
     half = width_m / 2
     turns = np.linspace(-0.82 * half, 0.82 * half, 24)
     bulge = 0.19 + 0.05 * np.cos(turns / half * 1.4) + 0.012 * np.sin(np.arange(24) * 2.1)
@@ -43,7 +43,7 @@ def winch(at_m: Point, width_m: float, materials: ShipMaterials, load: int) -> M
 
 
 def gantry(at_m: Point, width_m: float, height_m: float, materials: ShipMaterials) -> Mesh:
-    """Build a portal that stands over the stern, leans aft and carries hanging blocks."""
+    """Build a gantry over the stern that leans aft and carries hanging blocks."""
     half, lean = width_m / 2, -0.25 * height_m
     frame = [(0, -half, 0), (lean, -0.85 * half, height_m), (lean, 0.85 * half, height_m), (0, half, 0)]
     portal = polyline_tubes(frame, 0.06, materials.trim, sides=12)
@@ -63,7 +63,7 @@ def gantry(at_m: Point, width_m: float, height_m: float, materials: ShipMaterial
 
 
 def derrick(foot_m: Point, tip_m: Point, top_m: Point, materials: ShipMaterials) -> Mesh:
-    """Build a boom with a hook from foot to tip, held by wires from top_m."""
+    """Build a derrick: a boom from foot to tip, with a hook, held by wires from top_m."""
     middle = (foot_m + tip_m) / 2
     boom = tubes(
         [foot_m, middle], [middle, tip_m], np.array([[0.03, 0.05], [0.05, 0.025]]), materials.trim, sides=12
@@ -137,7 +137,7 @@ def containers(at_m: Points, colours: tuple[int, ...]) -> Mesh:
 
 
 def hatches(x_m: tuple[float, float], width_m: float, z_m: float, materials: ShipMaterials) -> Mesh:
-    """Build a hatch coaming with ribbed covers."""
+    """Build a ribbed hatch coaming with covers."""
     length, middle = x_m[1] - x_m[0], sum(x_m) / 2
     coaming = boxes((middle, 0, z_m + 0.1), (length, width_m, 0.3), materials.trim)
     count = max(int(length / 0.55), 2)
@@ -194,7 +194,7 @@ def vents(at_m: Points, materials: ShipMaterials) -> Mesh:
 
 
 def bitts(at_m: Points, materials: ShipMaterials) -> Mesh:
-    """Build bitts [N], each a pair of posts in line with the ship, with a rope belayed around them."""
+    """Build pairs of bitts [N] in line with the ship, with a rope belayed around each pair."""
     post = [(0.045, 0), (0.045, 0.17), (0.06, 0.18), (0.06, 0.21), (0, 0.22)]
     pair = [lathe(post, materials.dark, 12).translate(x=x) for x in (-0.1, 0.1)]
     angle = np.linspace(0, 6 * np.pi, 49)
@@ -214,7 +214,7 @@ def coil(at_m: Point, materials: ShipMaterials) -> Mesh:
 def flag(
     rng: np.random.Generator, foot_m: Point, height_m: float, materials: ShipMaterials, cloth: int
 ) -> Mesh:
-    """Build a staff with a flag that blows aft."""
+    """Build a flag on a staff, blowing aft."""
     top = foot_m + [-0.1, 0, height_m]
     staff = tubes(foot_m, top, 0.011, materials.white)
     x, z = np.meshgrid(np.linspace(0, 0.5, 20), np.linspace(-0.3, 0, 8))

@@ -1,4 +1,4 @@
-"""Superstructures of ships: deckhouses, funnels, masts, lifebuoys and fenders. The bow is at +x."""
+"""Deckhouses, funnels, masts, lifebuoys and fenders for ships. The bow is at +x."""
 
 from dataclasses import dataclass, replace
 
@@ -34,7 +34,7 @@ class ShipMaterials:
         house: walls of the deckhouses.
         roof: roofs and decks.
         trim: second colour, for funnels, cranes and doors.
-        white: light paint of masts and canisters.
+        white: light paint for masts and canisters.
         dark: black paint and rubber.
         glass: window panes.
         steel: bare or galvanised metal.
@@ -60,7 +60,7 @@ class House:
     Attributes:
         x_m: aft and forward ends of the foot.
         width_m: width of the foot.
-        z_m: heights of foot and top.
+        z_m: heights of the foot and the top.
         lean_m: inward lean of the aft, forward and side walls at the top; negative values lean outwards.
     """
 
@@ -70,9 +70,9 @@ class House:
     lean_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def corners_m(self, spare_m: float = 0.0) -> tuple[Points, Points]:
-        """Return the corners of foot and top, each [4, 3] and moved outwards by spare_m.
+        """Return the corners of the foot and the top, each [4, 3] and moved outwards by spare_m.
 
-        Their order is aft starboard, forward starboard, forward port, aft port.
+        The order is aft starboard, forward starboard, forward port and aft port.
         """
         aft, forward, side = self.lean_m
         half = self.width_m / 2 + spare_m
@@ -87,7 +87,7 @@ class House:
     def walls_m(self) -> Quads:
         """Return the starboard, forward, port and aft walls.
 
-        Each wall starts at its lower left corner, as seen from outside.
+        Each wall starts at its lower-left corner, as seen from outside.
         """
         foot, top = self.corners_m()
         return np.stack([foot, np.roll(foot, -1, 0), np.roll(top, -1, 0), top], 1)
@@ -113,7 +113,7 @@ def windows(
 ) -> Mesh:
     """Build a row of framed panes on a wall.
 
-    band: lower and upper edge of the panes as shares of the wall's height.
+    band: lower and upper edges of the panes, as fractions of the wall's height.
     """
     edges = np.linspace(0.06, 0.94, count + 1)
     half = gap / 2 * (edges[1] - edges[0])
@@ -128,7 +128,7 @@ def windows(
 
 
 def door(wall_m: Float[np.ndarray, "4 3"], at: float, materials: ShipMaterials) -> Mesh:
-    """Build a door with a small window; `at` is its position as a share of the wall's length."""
+    """Build a door with a small window; `at` is the door's position as a fraction of the wall's length."""
     length, height = (float(np.linalg.norm(wall_m[k] - wall_m[0])) for k in (1, 3))
     half = 0.3 * min(height, 1.0) / length
     leaf = _quads_on_wall(wall_m, (np.array([at - half]), np.array([at + half])), (0.06, 0.82), _FRAME_M)
@@ -189,7 +189,7 @@ def ship_mast(rng: np.random.Generator, foot_m: Point, height_m: float, material
 
 
 def _radar(rng: np.random.Generator, at_m: Point, materials: ShipMaterials) -> Mesh:
-    """Build a radar scanner on a pedestal, on a bracket in front of the mast."""
+    """Build a radar scanner with a pedestal and a bracket in front of the mast."""
     spin = rotation((0, 0, 1), rng.uniform(0, 180))[None, :3, :3]
     bar = boxes(at_m + [0, 0, 0.14], (0.07, 0.75, 0.07), materials.white, spin)
     bracket = boxes(at_m + [-0.06, 0, -0.02], (0.24, 0.1, 0.03), materials.white)
@@ -204,7 +204,7 @@ def stays(tops_m: Points, feet_m: Points, materials: ShipMaterials) -> Mesh:
 
 
 def lifebuoys(at_m: Points, outwards: Points, materials: ShipMaterials) -> Mesh:
-    """Build lifebuoys of four orange and four white segments, facing `outwards`."""
+    """Build lifebuoys with four orange and four white segments, facing in the directions `outwards`."""
     angle = np.linspace(0, 2 * np.pi, 9)
     ring = lathe(
         np.stack([0.15 + 0.04 * np.cos(angle), 0.04 * np.sin(angle)], -1), materials.orange, sections=24
@@ -229,7 +229,11 @@ def _quads_on_wall(
     up: tuple[float, float],
     off_m: float,
 ) -> Quads:
-    """Return quads that cover shares of a wall's length and height, off_m in front of the wall."""
+    """Return quads that lie off_m in front of a wall.
+
+    across: left and right edges of the quads, as fractions of the wall's length.
+    up: lower and upper edges of the quads, as fractions of the wall's height.
+    """
     a, b, c, d = wall_m
     out = np.cross(b - a, d - a)
     out = off_m * out / np.linalg.norm(out)

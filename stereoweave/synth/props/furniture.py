@@ -1,4 +1,4 @@
-"""Random furniture, plants and household objects of about one metre."""
+"""Random furniture, plants and household objects about one metre in size."""
 
 import numpy as np
 from jaxtyping import Float
@@ -18,7 +18,7 @@ from stereoweave.synth.world import Mesh, join_meshes
 
 
 def chair(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """Build a chair of bars with a seat and a back of slats or uprights."""
+    """Build a chair with round legs and rungs, a seat, and a back of slats or uprights."""
     width_m, seat_m = rng.uniform(0.4, 0.5), rng.uniform(0.42, 0.5)
     leg_m, half_m = rng.uniform(0.012, 0.025), width_m / 2
     feet = np.array([[x, y, 0.0] for y in (-half_m, half_m) for x in (-half_m, half_m)])
@@ -43,7 +43,7 @@ def chair(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def table(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """Build a table with cups on it; the top is round on one foot, or rectangular on four legs."""
+    """Build a table with cups on it: a round table on one foot, or a rectangular table on four legs."""
     height_m = rng.uniform(0.45, 0.75)
     if rng.random() < 0.4:
         rim = np.array([[0, 0.96], [0.5, 0.96], [0.5, 1.0], [0.0, 1.0]]) * [1, height_m]
@@ -71,7 +71,7 @@ def leaning_ladder(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def shelf(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """Build a bookcase with boards between two sides, full of books."""
+    """Build a bookcase with boards between two sides, filled with books."""
     count, depth_m = int(rng.integers(2, 6)), rng.uniform(0.16, 0.28)
     levels = np.linspace(0.03, 1.0, count + 1)
     boards = boxes([[0, 0, z] for z in levels], [0.7, depth_m, 0.02], style.main)
@@ -84,7 +84,7 @@ def shelf(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def book_stack(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """Build a skewed stack of books, with pages in another material."""
+    """Build an untidy stack of books, with covers and pages in different materials."""
     count = int(rng.integers(4, 14))
     thick_m = rng.uniform(0.03, 0.1, count)
     middles_m = np.cumsum(thick_m) - thick_m / 2
@@ -114,7 +114,7 @@ def picture(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def plant(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """Build a potted plant with long bent leaves."""
+    """Build a potted plant with long, bent leaves."""
     count, pot_m = int(rng.integers(20, 70)), rng.uniform(0.12, 0.2)
     pot = (
         np.array([[0, 0], [0.7, 0], [1, 1.4], [1.1, 1.4], [1.1, 1.6], [0.9, 1.6], [0.85, 1.3], [0, 1.3]])
@@ -135,7 +135,7 @@ def plant(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def bush(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """Build a ball of leaves around a stem."""
+    """Build a bush: a ball of leaves around a stem."""
     count = int(rng.integers(150, 400))
     directions = rng.normal(size=(count, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -149,7 +149,7 @@ def bush(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def bench(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """Build a bench of slats."""
+    """Build a slatted bench."""
     count, y = int(rng.integers(3, 6)), np.linspace(-0.15, 0.15, 5)
     slats = boxes(
         [[0, at, 0.42] for at in np.linspace(-0.16, 0.16, count)], [1.0, 0.22 / count, 0.03], style.main
@@ -181,7 +181,7 @@ def stool(rng: np.random.Generator, style: PropStyle) -> Mesh:
 def _standing_books(
     rng: np.random.Generator, style: PropStyle, width_m: float, height_m: float, depth_m: float
 ) -> Mesh:
-    """Build books that stand side by side on z = 0, in alternating materials."""
+    """Build books that stand side by side on z = 0, each in one of two materials."""
     thick_m = rng.uniform(0.012, 0.05, 40)
     ends_m = np.cumsum(thick_m)
     used = ends_m < width_m * rng.uniform(0.6, 1)
@@ -196,7 +196,7 @@ def _standing_books(
 
 
 def _blade(rng: np.random.Generator, material: int) -> Mesh:
-    """Build a leaf that rises from the origin and bends over towards x."""
+    """Build a leaf that rises from the origin and bends over towards +x."""
     share = np.linspace(0, 1, 9)[:, None]
     bend = rng.uniform(0.6, 2.2) * share
     x, z = np.cumsum(np.sin(bend), 0) / 11, np.cumsum(np.cos(bend), 0) / 11
@@ -211,7 +211,7 @@ def _leaves(
     across: Float[np.ndarray, "n 3"],
     material: int,
 ) -> Mesh:
-    """Build flat leaves, each a rhombus."""
+    """Build flat, diamond-shaped leaves."""
     outwards = np.cross(along, across)
     outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
     ring = np.stack([centres_m - along, centres_m + across, centres_m + along, centres_m - across], 1)

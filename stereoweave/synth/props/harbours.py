@@ -1,4 +1,4 @@
-"""Surroundings of ships: a harbour quay, or open sea with a coast."""
+"""Surroundings of ships: a harbour quay, or the open sea with a distant coast."""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ _BOLLARDS_M = np.array([-5.2, -1.0, 1.2, 6.0, -14.0, 14.0])
 
 
 def open_water(rng: np.random.Generator, palette: Palette) -> Mesh:
-    """Build a sea with buoys and a distant ring of wooded hills."""
+    """Build the open sea with buoys and a distant ring of wooded hills."""
     pieces = [
         surroundings.sea(rng, palette),
         surroundings.hills(rng, palette, distance_m=rng.uniform(110, 170)),

@@ -1,4 +1,4 @@
-"""Ship hulls with painted skin and deck, and points on both for fittings."""
+"""Ship hulls: painted skins, decks, and the points on both where fittings are attached."""
 
 from dataclasses import dataclass, replace
 
@@ -16,14 +16,14 @@ class Hull:
     """Hull with its bow at +x and its waterline at z = 0.
 
     Attributes:
-        length_m: length at the waterline, which reaches from -length_m / 2 to length_m / 2.
+        length_m: length at the waterline, from x = -length_m / 2 to x = length_m / 2.
         beam_m: greatest breadth of the deck.
-        draft_m: depth of the keel.
+        draft_m: depth of the keel below the waterline.
         freeboard_m: height of the bulwark's edge amidships.
         sheer_m: additional height of the bulwark's edge at the stern and at the bow.
-        stern: breadth of the transom as a share of the beam.
-        rise: rise of the keel at the stern as a share of the draft.
-        rise_to: share of the length over which the keel rises.
+        stern: breadth of the transom as a fraction of the beam.
+        rise: rise of the keel at the stern as a fraction of the draft.
+        rise_to: fraction of the length, measured from the stern, over which the keel rises.
         rake_m: forward lean of the stem.
         bulwark_m: height of the bulwark above the deck.
     """
@@ -40,7 +40,7 @@ class Hull:
     bulwark_m: float = 0.25
 
     def edge_m(self, share: Values) -> Values:
-        """Return the height of the bulwark's edge at a share of the length, from 0 (stern) to 1 (bow)."""
+        """Return the height of the bulwark's edge at a fraction of the length, from 0 (stern) to 1 (bow)."""
         aft, forward = np.clip((0.4 - share) / 0.4, 0, 1), np.clip((share - 0.4) / 0.6, 0, 1)
         return self.freeboard_m + self.sheer_m[0] * aft**2 + self.sheer_m[1] * forward**2
 
@@ -49,12 +49,12 @@ class Hull:
         return float(self.edge_m(x / self.length_m + 0.5)) - self.bulwark_m
 
     def keel_m(self, share: Values) -> Values:
-        """Return the height of the keel, which is negative, at a share of the length."""
+        """Return the height of the keel, a negative number, at a fraction of the length."""
         aft = np.clip(1.35 - 1.35 * share / self.rise_to, 0, 1)
         return -self.draft_m * (1 - self.rise * aft * aft * (3 - 2 * aft))
 
     def side_m(self, share: Values, z: Values, side: Values) -> Float[np.ndarray, "... 3"]:
-        """Return points on the skin at a share of the length and a height.
+        """Return points on the skin at the given fractions of the length and heights.
 
         side: 1 for port (+y), -1 for starboard.
         """
@@ -70,7 +70,7 @@ class Hull:
         return np.stack([x, side * y, z], -1)
 
     def skin(self, bottom: int, stripe: int, topside: int, stripe_m: float = 0.12) -> Mesh:
-        """Build the outside of the hull, with a stripe of paint above the waterline, and the transom."""
+        """Build the outside of the hull and the transom, with a painted stripe above the waterline."""
         share, dry = self._topside(stripe_m)
         wet = self.keel_m(share) * (1 - np.linspace(0, 1, 10) ** 3)
         z = np.concatenate([wet, dry], 1)
@@ -102,7 +102,8 @@ class Hull:
     def patch(self, stations: tuple[int, int], levels: tuple[int, int], side: int, material: int) -> Mesh:
         """Build a plate on the skin above the stripe.
 
-        The skin has 60 cells along the hull and 7 upwards there; `stations` and `levels` are ranges of them.
+        Above the stripe, the skin is a grid of 60 cells along the hull by 7 cells in height. The plate covers
+        the cells in the ranges `stations` (along the hull) and `levels` (in height).
         """
         share, z = self._topside(0.12)
         cells = np.s_[stations[0] : stations[1] + 1, levels[0] : levels[1] + 1]
@@ -114,10 +115,10 @@ class Hull:
         return replace(plate, corners_m=outside, uv_m=uv - uv.min((0, 1)))
 
     def _topside(self, stripe_m: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the grid of the skin above the stripe.
+        """Return the grid points of the skin above the stripe.
 
-        It consists of shares of the length [61, 1], and of heights [61, 8] from the stripe to the bulwark's
-        edge.
+        The points are given as fractions of the length [61, 1] and as heights [61, 8] from the stripe to the
+        edge of the bulwark.
         """
         share = np.linspace(0, 1, 61)[:, None]
         return share, stripe_m + (self.edge_m(share) - stripe_m) * np.linspace(0, 1, 8)

@@ -1,4 +1,4 @@
-"""Interiors: floor, walls, ceiling, lamps, and objects on the walls."""
+"""Interiors with a floor, walls, a ceiling, lamps and objects on the walls."""
 
 from collections.abc import Callable, Sequence
 
@@ -35,7 +35,7 @@ def shell(
 ) -> Mesh:
     """Build a room around the z axis, with its floor at z = 0 and objects on its walls.
 
-    open_side: the missing wall, counted counter-clockwise from the wall at the largest x.
+    open_side: number of the wall to omit, counted counter-clockwise from 0 at the largest x; None keeps all.
     """
     x, y, height_m = (float(v) for v in size_m)
     distance_m = 0.6 * max(x, y)
@@ -61,7 +61,7 @@ def shell(
 def pendants(
     rng: np.random.Generator, palette: Palette, spots_m: Float[np.ndarray, "n 3"], ceiling_m: float
 ) -> Mesh:
-    """Build lampshades with glowing bulbs at the spots, on cords from the ceiling."""
+    """Build pendant lamps at the spots: shades with glowing bulbs, on cords from the ceiling."""
     shade = palette.add(Material(texture="plain", tint=draw_muted_colour(rng, 0.4), roughness=0.5))
     bulb = palette.add(Material(texture="plain", tint=(1.0, 0.95, 0.85), glow=4.0))
     wide_m, high_m = rng.uniform(0.1, 0.25), rng.uniform(0.1, 0.25)
@@ -72,7 +72,7 @@ def pendants(
 
 
 def draw_lamps(rng: np.random.Generator, spots_m: Float[np.ndarray, "n 3"]) -> tuple[Lamp, ...]:
-    """Draw a room's lamps, which share one warm or cold colour and differ in strength."""
+    """Draw random lamps for a room, all of the same warm or cold colour but of different strengths."""
     warm = rng.uniform(0, 1)
     colour = np.array([1.0, 0.95 - 0.2 * warm, 0.92 - 0.5 * warm])
     strengths = np.exp(rng.normal(0, 0.6, len(spots_m)))
@@ -86,7 +86,7 @@ def draw_lamps(rng: np.random.Generator, spots_m: Float[np.ndarray, "n 3"]) -> t
 def draw_lamp_spots(
     rng: np.random.Generator, size_m: Float[np.ndarray, "3"], eyes_m: Float[np.ndarray, "k 3"]
 ) -> Float[np.ndarray, "n 3"]:
-    """Draw positions of one to four lamps in the upper part of a room, away from the cameras."""
+    """Draw random positions of one to four lamps in the upper part of a room, away from the cameras."""
     low_m, high_m = size_m * [-0.4, -0.4, 0.68], size_m * [0.4, 0.4, 0.85]
     spots_m = rng.uniform(low_m, high_m, (40, 3))
     clear_m = np.linalg.norm(spots_m[:, None] - eyes_m, axis=2).min(1)
@@ -94,7 +94,7 @@ def draw_lamp_spots(
 
 
 def indoor_light(rng: np.random.Generator, sky: Sky, lamps: Sequence[Lamp]) -> tuple[Sky, float]:
-    """Draw a room's ambient light, as a sky without sun, and the exposure of its images."""
+    """Draw random ambient light for a room, as a sky without a sun, and the exposure of the images."""
     ambient = rng.uniform(0.15, 0.6)
     warm = np.array([1.0, 0.95, 0.87])
 
@@ -116,7 +116,7 @@ def indoor_light(rng: np.random.Generator, sky: Sky, lamps: Sequence[Lamp]) -> t
 def _panel(rng: np.random.Generator, origin: Corner, along: Corner, up: Corner, material: int) -> Mesh:
     """Build a slightly uneven surface whose normal is `along` x `up`.
 
-    It extends slightly beyond its corners, so that adjacent surfaces leave no gap.
+    The surface extends slightly beyond its corners, so adjacent surfaces leave no gap.
     """
     share = np.linspace(-0.01, 1.01, 29)
     u, v = np.meshgrid(share, share)
@@ -129,7 +129,10 @@ def _panel(rng: np.random.Generator, origin: Corner, along: Corner, up: Corner, 
 
 
 def _wall_pose(side: int, away_m: float) -> Float[np.ndarray, "4 4"]:
-    """Return a wall's pose in the room; the wall's x runs along it, y into the room and z up."""
+    """Return the pose of a wall in the room.
+
+    In the coordinates of the wall, x runs along the wall, y into the room and z up.
+    """
     angle = side * np.pi / 2
     inwards = -np.array([np.cos(angle), np.sin(angle), 0])
     pose = np.eye(4)
@@ -141,7 +144,7 @@ def _wall_pose(side: int, away_m: float) -> Float[np.ndarray, "4 4"]:
 def _hang_on_wall(
     rng: np.random.Generator, palette: Palette, length_m: float, height_m: float, trim: int
 ) -> list[Mesh]:
-    """Build objects on one wall, each in its own section."""
+    """Build objects on one wall, each in its own section of the wall."""
     count = int(rng.integers(1, min(int(length_m / 1.4), 3) + 1))
     stretch_m = length_m / count
     kinds: list[Hanging] = [_window, _door, _poster, _shelves, _radiator, _curtain]
@@ -164,7 +167,7 @@ def _frame(width_m: float, low_m: float, high_m: float, bar_m: float, trim: int)
 
 
 def _window(rng: np.random.Generator, palette: Palette, width_m: float, height_m: float, trim: int) -> Mesh:
-    """Build a window with daylight behind its panes, glazing bars and a sill."""
+    """Build a window with glazing bars, a sill and daylight behind its panes."""
     low_m, high_m = 0.85, min(height_m - 0.25, 2.2)
     outside = Material(
         texture=str(rng.choice(["photograph", "sky", "leaves"])),

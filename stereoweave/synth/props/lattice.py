@@ -1,7 +1,7 @@
-"""Lattice structures and related parts: masts, cables, ladders, railings, insulator strings.
+"""Lattice structures and related parts: masts, cables, ladders, railings and insulator strings.
 
-A lattice is built as segments from joint to joint, so that its members meet exactly, and converted to tubes
-at the end. Lengths are in metres, and z is up.
+A lattice is built as segments from joint to joint, so its members meet exactly. The segments are converted to
+tubes at the end. Lengths are in metres, and z is up.
 """
 
 from collections.abc import Sequence
@@ -49,9 +49,9 @@ class Truss:
         materials: Sequence[int],
         bands_m: tuple[float, float],
     ) -> Mesh:
-        """Build the members as round bars, painted in bands by their midpoints.
+        """Build the members as round bars, painted in bands; the midpoint of a member determines its band.
 
-        bands_m: length of a band in x and in z.
+        bands_m: length of a band along x and along z.
         """
         return join_meshes(
             self._within(band, len(materials), bands_m).mesh(leg_radius_m, brace_radius_m, material)
@@ -68,7 +68,7 @@ class Truss:
 def mast_levels(
     stations_m: Sequence[float], widths_m: Sequence[float], ratio: float
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-    """Return the heights of a tapering mast's joints and its widths at those heights.
+    """Return the heights of a tapering mast's joints, and the widths of the mast at those heights.
 
     Every station is a joint; the panels between stations are about `ratio` times as high as they are wide.
     """
@@ -87,7 +87,9 @@ def mast_rings(
 ) -> Float[np.ndarray, "k m 3"]:
     """Return the joints of an upright mast: one regular polygon per height.
 
-    A square has its sides along x and y. widths_m: side length at each height.
+    The sides of a square are along x and y.
+
+    widths_m: side length at each height.
     """
     angle = (np.arange(corners) + 0.5) * 2 * np.pi / corners
     radius = np.broadcast_to(widths_m, heights_m.shape) / (2 * np.sin(np.pi / corners))
@@ -96,7 +98,7 @@ def mast_rings(
 
 
 def truss(rings_m: Float[np.ndarray, "k m 3"], bracing: Bracing = "zigzag") -> Truss:
-    """Return the lattice through rings of joints.
+    """Return the lattice that connects rings of joints.
 
     Each face between two rings is braced by both diagonals ("cross"), by diagonals of alternating direction
     ("zigzag"), or by diagonals of one direction ("single").
@@ -123,7 +125,7 @@ def bars(
 
 
 def chain_segments(points_m: Float[np.ndarray, "n k 3"]) -> Segments:
-    """Return the segments of N polylines, as one array."""
+    """Return the segments of N polylines as one array."""
     return _segments(points_m[:, :-1], points_m[:, 1:])
 
 
@@ -159,7 +161,7 @@ def ladder(
     width_m: float,
     material: int,
 ) -> Mesh:
-    """Build a ladder with rungs along `sideways`, spaced by 3/4 of its width."""
+    """Build a ladder with rungs along `sideways`, at intervals of 3/4 of its width."""
     foot, head = np.array(foot_m), np.array(head_m)
     half = width_m / 2 * np.array(sideways) / np.linalg.norm(sideways)
     count = max(round(np.linalg.norm(head - foot) / (0.75 * width_m)), 2)
@@ -181,7 +183,7 @@ def cage(
     width_m: float,
     material: int,
 ) -> Mesh:
-    """Build the safety cage (hoops and strips) of an upright ladder."""
+    """Build the safety cage of an upright ladder from hoops and strips."""
     foot, head = np.array(foot_m), np.array(head_m)
     out = np.array(outwards) / np.linalg.norm(outwards)
     side = np.cross(out, [0.0, 0.0, 1.0])
@@ -231,7 +233,7 @@ def poses_towards(at_m: Numbers, directions: Numbers) -> Float[np.ndarray, "n 4 
 
 
 def insulators(starts_m: Points, ends_m: Points, radius_m: float, discs: int, material: int) -> Mesh:
-    """Build insulator strings of bell-shaped discs that open towards each string's end."""
+    """Build insulator strings of bell-shaped discs that open towards the end of the string."""
     starts_m, ends_m = np.broadcast_arrays(np.atleast_2d(starts_m), np.atleast_2d(ends_m))
     pitch = float(np.linalg.norm(ends_m - starts_m, axis=1).mean()) / discs
     bell = np.array([[0.0, 0.15], [0.95, 0.15], [1.0, 0.3], [0.35, 0.75], [0.3, 1.0]]) * (radius_m, pitch)
@@ -243,7 +245,7 @@ def insulators(starts_m: Points, ends_m: Points, radius_m: float, discs: int, ma
 
 
 def galvanised_steel(rng: np.random.Generator) -> Material:
-    """Draw a material of galvanised steel, from bright to dull and dark."""
+    """Draw a random material for galvanised steel, from bright to dark."""
     grey = rng.uniform(0.35, 0.85)
     return Material(
         texture="steel",
@@ -257,7 +259,7 @@ def galvanised_steel(rng: np.random.Generator) -> Material:
 
 
 def painted_steel(rng: np.random.Generator, tint: Colour, roughness: float = 0.55) -> Material:
-    """Draw a material of painted steel in a slight variation of the given colour."""
+    """Draw a material for painted steel in a slight variation of the given colour."""
     shade = rng.uniform(0.85, 1.1)
     red, green, blue = (float(np.clip(shade * part, 0, 1)) for part in tint)
     return Material(
@@ -271,7 +273,7 @@ def painted_steel(rng: np.random.Generator, tint: Colour, roughness: float = 0.5
 
 
 def aviation_paints(rng: np.random.Generator) -> tuple[Material, Material]:
-    """Draw the red and white paints that mark obstacles to aviation."""
+    """Draw random red and white paints for aviation obstacle markings."""
     return painted_steel(rng, (0.55, 0.07, 0.04)), painted_steel(rng, (0.8, 0.8, 0.77))
 
 

@@ -11,7 +11,7 @@ from stereoweave.synth.stage import Palette
 from stereoweave.synth.world import Material, Mesh, join_meshes
 
 _CLOTHS = ("cloth", "plain", "plain", "paint")
-# Trunk of a person 1.7 m tall, from bottom to top: height, half-width along x, half-width along y.
+# Trunk of a person 1.7 m tall, from bottom to top: height, half-width along x and half-width along y.
 _TRUNK_M = np.array(
     [
         [0.84, 0.08, 0.11],
@@ -29,7 +29,7 @@ _TRUNK_M = np.array(
 
 @dataclass(frozen=True, kw_only=True)
 class Clothes:
-    """Materials of a person."""
+    """Materials of a person's clothes, skin and hair."""
 
     coat: int
     trousers: int
@@ -38,7 +38,7 @@ class Clothes:
 
 
 def draw_clothes(rng: np.random.Generator, palette: Palette) -> Clothes:
-    """Draw a person's materials, many of them plain."""
+    """Draw random materials for a person's clothes, skin and hair, many of them plain."""
     brown = rng.uniform(0.15, 1.0)
     skin = (0.75 * brown, 0.5 * brown, 0.38 * brown)
     return Clothes(
@@ -50,7 +50,7 @@ def draw_clothes(rng: np.random.Generator, palette: Palette) -> Clothes:
 
 
 def person(rng: np.random.Generator, clothes: Clothes) -> Mesh:
-    """Draw a person, 1.5 to 1.9 m tall, standing or walking."""
+    """Build a person 1.5 to 1.9 m tall, standing or walking."""
     stride_m = rng.choice([0.03, rng.uniform(0.1, 0.35)])
     limbs = [limb for side in (-1, 1) for limb in _limbs(rng, clothes, side, stride_m)]
     head = spheres([[0.015, 0, 1.655]], [[0.095, 0.078, 0.12]], clothes.skin, subdivisions=3)
@@ -61,7 +61,7 @@ def person(rng: np.random.Generator, clothes: Clothes) -> Mesh:
 
 
 def animal(rng: np.random.Generator, palette: Palette) -> Mesh:
-    """Draw an animal about 1 m long, plump or slender, with four legs, ears and a tail."""
+    """Build a plump or slender animal about 1 m long, with four legs, ears and a tail."""
     fur, other = (
         palette.add(draw_material_from(rng, ("plain", "cloth", "plain", "bark"), 1.5)) for _ in range(2)
     )
@@ -91,7 +91,7 @@ def animal(rng: np.random.Generator, palette: Palette) -> Mesh:
 
 
 def _limbs(rng: np.random.Generator, clothes: Clothes, side: int, stride_m: float) -> list[Mesh]:
-    """Build one leg with its shoe and one arm with its hand; `side` is -1 or 1 along y."""
+    """Build the leg, shoe, arm and hand on one side of a person; `side` is 1 for +y and -1 for -y."""
     ankle = np.array([side * stride_m, 0.1 * side, 0.08])
     leg = _bent_limb(np.array([0, 0.09 * side, 0.93]), ankle, 0.04, (0.1, 0.055), clothes.trousers)
     shoe = spheres([ankle + [0.05, 0, -0.03]], [[0.14, 0.05, 0.06]], clothes.hair)
@@ -108,7 +108,7 @@ def _bent_limb(
     radii_m: tuple[float, float],
     material: int,
 ) -> Mesh:
-    """Build a round limb between two points, bent towards x in the middle."""
+    """Build a round limb between two points, bent by bulge_m along x in the middle."""
     share = np.linspace(0, 1, 9)[:, None]
     path_m = (1 - share) * start_m + share * end_m + 4 * share * (1 - share) * [bulge_m, 0, 0]
     return sweep(path_m, np.linspace(*radii_m, 9), material, 12)

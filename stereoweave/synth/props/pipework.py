@@ -15,14 +15,14 @@ Path = Float[np.ndarray, "_ 3"]
 
 
 def pipes(paths_m: Sequence[Path], radii_m: Sequence[float], material: int) -> Mesh:
-    """Build pipes with elbows at corners and a pair of flanges on each long section."""
+    """Build pipes with elbows at the corners and a pair of flanges on each long section."""
     counts = [len(path) - 1 for path in paths_m]
     starts, ends = (
         np.concatenate([path[part] for path in paths_m]) for part in (slice(None, -1), slice(1, None))
     )
     radii, length = np.repeat(radii_m, counts), np.linalg.norm(ends - starts, axis=1)
     elbows = np.concatenate([path[1:-1] for path in paths_m])
-    # Wider than the pipes, so that a sphere of 20 faces closes the gap between their ends.
+    # The spheres have only 20 faces, so they must be wider than the pipes to close the gaps at corners.
     bent = spheres(elbows, 1.15 * np.repeat(radii_m, np.array(counts) - 1), material, subdivisions=0)
     long = length > 0.5
     along = (ends - starts)[long] / length[long, None]
@@ -54,9 +54,9 @@ def rack(
     lines: Sequence[int],
     materials: RefineryMaterials,
 ) -> Mesh:
-    """Build a steel rack along x with layers of parallel pipes, some of which have expansion loops.
+    """Build a steel rack along x with layers of parallel pipes, some with expansion loops.
 
-    lines: materials to choose from for the pipes.
+    lines: candidate materials for the pipes.
     """
     by_coat: dict[int, list[tuple[Path, float]]] = {}
     for level_m in levels_m:
@@ -95,7 +95,7 @@ def _frame(half_m: float, levels_m: Sequence[float], steel: int) -> Mesh:
 
 
 def _line_on_rack(rng: np.random.Generator, half_m: float, y: float, z: float) -> Path:
-    """Draw the path of a pipe up from the ground, along the rack and down again.
+    """Draw a random path for a pipe that runs up from the ground, along the rack and down again.
 
     Some paths have an expansion loop.
     """

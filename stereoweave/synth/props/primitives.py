@@ -1,8 +1,8 @@
-"""Geometric primitives: tubes, boxes, solids of revolution, lofts, sheets, spheres.
+"""Geometric primitives: tubes, boxes, solids of revolution, lofts, sheets and spheres.
 
-Tubes, boxes and spheres are vectorised over arrays of pieces, because a lattice mast has a thousand struts.
-Lengths are in metres, and z is up. Points and sizes are [N, 3], or one [3] for all pieces. Texture
-coordinates are metres along the surface.
+Tubes, boxes and spheres are vectorised over arrays of pieces, because a mast can have a thousand struts.
+Lengths are in metres, and z is up. Points and sizes are [N, 3], or [3] if they are the same for all pieces.
+Texture coordinates are in metres along the surface.
 """
 
 import functools
@@ -43,9 +43,9 @@ def tubes(  # noqa: PLR0913 - dimensions and options
     sides: int = 6,
     capped: bool = True,
 ) -> Mesh:
-    """Build straight round bars [N] from start to end; `capped` closes both ends with flat caps.
+    """Build straight round bars [N] from start to end; if `capped`, flat caps close both ends.
 
-    radii_m: one radius for all bars, [N], or [N, 2] for start and end.
+    radii_m: one radius for all bars, one radius per bar [N], or the radii at both ends of each bar [N, 2].
     """
     starts, ends = np.broadcast_arrays(np.atleast_2d(starts_m), np.atleast_2d(ends_m))
     count = len(starts)
@@ -61,7 +61,7 @@ def tubes(  # noqa: PLR0913 - dimensions and options
     rings = middles[:, :, None] + radii[..., None, None] * outwards[:, None]
     around = np.arctan2(plan.circle[:, 1], plan.circle[:, 0]) % (2 * np.pi) * radii.max(1)[:, None]
     around[:, -1] = 2 * np.pi * radii.max(1)
-    # Each piece shows a different part of its texture.
+    # Each piece shows a different part of the texture.
     offset = np.broadcast_to((np.arange(count) * 0.618)[:, None] % 7, around.shape)
     sides_uv = [np.stack([around, offset + up], -1) for up in (0, length[:, None])]
     ends_uv = radii[..., None, None] * plan.circle
@@ -80,7 +80,7 @@ def tubes(  # noqa: PLR0913 - dimensions and options
 def boxes(
     centres_m: Numbers, sizes_m: Numbers, material: int, turns: Float[np.ndarray, "_ 3 3"] | None = None
 ) -> Mesh:
-    """Build boxes [N]; `turns` rotates each about its centre."""
+    """Build boxes [N]; `turns` rotates each box about its centre."""
     centres, sizes = np.broadcast_arrays(np.atleast_2d(centres_m), np.atleast_2d(sizes_m))
     cube, face_normals = _cube()
     corners = cube[None] * (sizes / 2)[:, None, None]
@@ -95,7 +95,7 @@ def boxes(
 def lathe(profile_m: Numbers, material: int, sections: int = 32, crease_deg: float = 35) -> Mesh:
     """Build a solid of revolution around z.
 
-    Profile edges sharper than `crease_deg` stay sharp.
+    Edges where the direction of the profile changes by more than `crease_deg` stay sharp.
 
     profile_m: [K, 2], radius and height of points along the outside from bottom to top.
     """
@@ -122,7 +122,7 @@ def loft(rings_m: Float[np.ndarray, "k m 3"], material: int, capped: bool = True
     """Build a smooth closed surface through rings of points, such as a hull, a blade or a bent pipe.
 
     Rings run counter-clockwise as seen from the last ring towards the first, and do not repeat their first
-    point. `capped` closes the first and the last ring with triangle fans.
+    point. If `capped`, triangle fans close the first and the last ring.
     """
     rings = np.asarray(rings_m, np.float64)
     rings = np.concatenate([rings, rings[:, :1]], axis=1)
@@ -135,7 +135,7 @@ def loft(rings_m: Float[np.ndarray, "k m 3"], material: int, capped: bool = True
 def sweep(path_m: Numbers, radius_m: Numbers, material: int, sides: int = 8) -> Mesh:
     """Build a round pipe or cable along a path [K, 3].
 
-    radius_m: one radius, or one per point.
+    radius_m: one radius for the whole path, or one radius per point.
     """
     path = np.asarray(path_m, np.float64)
     along = np.gradient(path, axis=0)
@@ -148,9 +148,10 @@ def sweep(path_m: Numbers, radius_m: Numbers, material: int, sides: int = 8) -> 
 
 
 def sheet(points_m: Float[np.ndarray, "r c 3"], material: int, closed: bool = False) -> Mesh:
-    """Build a smooth surface through a grid of points; its normal is columns x rows.
+    """Build a smooth surface through a grid of points.
 
-    A sheet with x along columns and y along rows faces up. `closed`: the last column repeats the first.
+    A sheet faces up if x increases with the column index and y with the row index. Set `closed` if the last
+    column repeats the first.
     """
     points = np.asarray(points_m, np.float64)
     if closed:
@@ -168,7 +169,8 @@ def sheet(points_m: Float[np.ndarray, "r c 3"], material: int, closed: bool = Fa
 def spheres(centres_m: Numbers, radii_m: Numbers, material: int, subdivisions: int = 2) -> Mesh:
     """Build spheres [N].
 
-    radii_m: one radius for all spheres, [N], or [N, 3] for ellipsoids along the axes.
+    radii_m: one radius for all spheres, one radius per sphere [N], or the semi-axes of ellipsoids
+        along x, y and z [N, 3].
     """
     centres = np.atleast_2d(np.asarray(centres_m, np.float64))
     radii = np.asarray(radii_m, np.float64)
@@ -209,7 +211,7 @@ def prism(outline_m: Numbers, depth_m: float, material: int) -> Mesh:
 
 
 def copies(mesh: Mesh, poses: Float[np.ndarray, "n 4 4"]) -> Mesh:
-    """Return one copy of the mesh per pose [N, 4, 4]; poses may scale uniformly."""
+    """Return a mesh that contains one copy of `mesh` per pose [N, 4, 4]; poses may scale uniformly."""
     turns = poses[:, :3, :3].swapaxes(1, 2)
     scales = np.cbrt(np.abs(np.linalg.det(turns)))[:, None, None]
     corners = mesh.corners_m.reshape(-1, 3) @ turns.astype(np.float32)
@@ -244,9 +246,10 @@ def translation(x: float = 0, y: float = 0, z: float = 0) -> Float[np.ndarray, "
 
 
 def orthogonal_frames(along: Points) -> tuple[Points, Points]:
-    """Return two unit vectors [N, 3] that form right-handed frames with the unit directions [N, 3].
+    """Return two arrays of unit vectors [N, 3] that form right-handed frames with the unit directions [N, 3].
 
-    The first is horizontal; for directions within 2.5 degrees of vertical it is nearly parallel to y.
+    Vectors in the first array are horizontal or, for directions within 2.5 degrees of vertical, nearly
+    parallel to y.
     """
     helper = np.where(np.abs(along[:, 2:]) < 0.999, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
     across = np.cross(helper, along)
@@ -255,7 +258,7 @@ def orthogonal_frames(along: Points) -> tuple[Points, Points]:
 
 
 def polyline_tubes(points_m: Numbers, radius_m: float, material: int, sides: int = 6) -> Mesh:
-    """Build tubes along a polyline, as in railings, frames and cables with corners."""
+    """Build tubes along a polyline, such as a frame or a sagging wire."""
     points = np.asarray(points_m)
     return tubes(points[:-1], points[1:], radius_m, material, sides)
 
@@ -279,7 +282,7 @@ def _mesh_grids(
 
 
 def _drop_degenerate(mesh: Mesh) -> Mesh:
-    """Remove triangles without area, such as those of grid cells at a pole."""
+    """Remove triangles of zero area, such as those in grid cells at a pole."""
     a, b, c = mesh.corners_m.swapaxes(0, 1)
     kept = (np.abs(np.cross(b - a, c - a)) > 1e-12).any(1)
     if kept.all():
@@ -294,7 +297,7 @@ def _drop_degenerate(mesh: Mesh) -> Mesh:
 
 
 def _add_caps(walls: Mesh, ends: Float[np.ndarray, "n 2 m 3"], material: int) -> Mesh:
-    """Add triangle fans over the first and last rings, whose last point repeats the first."""
+    """Close the first and the last ring with triangle fans; a ring's last point repeats its first point."""
     fans = [walls]
     for k in (0, 1):
         ring = ends[:, k] if k else ends[:, k, ::-1]
@@ -322,13 +325,13 @@ def _make_mesh(corners: np.ndarray, normals: np.ndarray, uv: np.ndarray, materia
 
 
 def _transport_frames(along: Points) -> tuple[Points, Points]:
-    """Return two unit vectors [N, 3] across each point of a path.
+    """Return two arrays of unit vectors [N, 3] that are perpendicular to a path at its points.
 
-    They are carried along by parallel transport, so that a pipe does not twist.
+    Both vectors are parallel-transported along the path, so pipes do not twist.
     """
     across = orthogonal_frames(along[:1])[0][0]
     carried = []
-    # Plain floats are faster than arrays of three.
+    # Plain floats are faster than arrays of three elements.
     u, v, w = across.tolist()
     for x, y, z in along.tolist():
         off = u * x + v * y + w * z
@@ -341,7 +344,7 @@ def _transport_frames(along: Points) -> tuple[Points, Points]:
 
 
 def _revolve(circle: Float[np.ndarray, "s 2"], radius_and_height: np.ndarray) -> np.ndarray:
-    """Return rings [..., S, 3] of the given radii and heights [..., 2]."""
+    """Return rings [..., S, 3] with the given radii and heights [..., 2]."""
     radius, height = radius_and_height[..., None, :1], radius_and_height[..., None, 1:]
     level = radius * circle
     return np.concatenate([level, np.broadcast_to(height, (*level.shape[:-1], 1))], -1)
@@ -355,9 +358,9 @@ def _arc_lengths_m(points: Float[np.ndarray, "r c 3"], axis: int) -> Float[np.nd
 
 
 def _box_uv(corners: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Return texture coordinates by box projection.
+    """Return texture coordinates from a box projection.
 
-    They are the coordinates along the two axes other than the normal's dominant one.
+    These are the coordinates along the two axes other than the dominant axis of the normal.
     """
     axis = np.abs(normals[..., :1, :]).argmax(-1)[..., None]
     x, y, z = corners[..., 0], corners[..., 1], corners[..., 2]
@@ -368,11 +371,14 @@ def _box_uv(corners: np.ndarray, normals: np.ndarray) -> np.ndarray:
 
 
 class _TubeTopology(NamedTuple):
-    """Topology of a tube: indices [T, 3] into its points, normals and texture coordinates.
+    """Topology of a tube with S sides and T triangles.
 
-    The points are the ring [S + 1] at the start, the ring at the end, and both centres. The normals are those
-    of a ring [S + 1], then backwards and forwards along the tube. The texture coordinates are both rings for
-    the sides, then all points for the ends.
+    Attributes:
+        circle: [S + 1, 2], unit circle; the last point repeats the first.
+        points: [T, 3], indices into the points: the ring at the start, the ring at the end and both centres.
+        normals: [T, 3], indices into the normals: a ring, then backwards and forwards along the tube.
+        uv: [T, 3], indices into the texture coordinates: both rings for the sides, then all points for the
+            ends.
     """
 
     circle: Float[np.ndarray, "s 2"]
@@ -411,7 +417,7 @@ def _cube() -> tuple[Float[np.ndarray, "12 3 3"], Float[np.ndarray, "12 3 3"]]:
 def _ball(subdivisions: int) -> Float[np.ndarray, "n 3 3"]:
     """Return the triangles of a unit sphere.
 
-    It is an icosahedron whose triangles are split into four once per subdivision.
+    The sphere is an icosahedron, and each subdivision splits every triangle into four.
     """
     golden_ratio = (1 + math.sqrt(5)) / 2
     rectangle = np.array([(y, x * golden_ratio, 0) for x, y in product((1, -1), (-1, 1))])

@@ -1,4 +1,4 @@
-"""Random ship propellers, with pitched and skewed blades of round outline on a hub."""
+"""Random ship propellers: pitched and skewed blades with a round outline, on a hub."""
 
 from dataclasses import dataclass, replace
 
@@ -11,14 +11,14 @@ from stereoweave.synth.world import Mesh, join_meshes
 
 @dataclass(frozen=True, kw_only=True)
 class Propeller:
-    """Ship propeller around the x axis; aft is +x.
+    """Ship propeller around the x axis, with aft at +x.
 
     Attributes:
         radius_m: distance from the axis to the tips.
         blades: number of blades.
-        hub_share: radius of the hub as a share of radius_m.
-        pitch_share: pitch as a share of the diameter.
-        skew_deg: sweep of the tips.
+        hub_share: radius of the hub as a fraction of radius_m.
+        pitch_share: pitch as a fraction of the diameter.
+        skew_deg: sweep of the tips around the axis.
         rake_m: aft lean of the tips.
         chord_m: greatest width of a blade.
         tip: bluntness of the tips, from 3 (slender) to 9 (blunt).
@@ -42,13 +42,13 @@ class Propeller:
 
     @property
     def hub_half_m(self) -> float:
-        """Half the length of the hub, which covers the roots of the blades."""
+        """Half the length of the hub, which is long enough to cover the blade roots."""
         return 0.5 * 0.5 * self.chord_m * float(np.sin(self._pitch(self.hub_m))) + 0.08
 
     def sections_m(self, spans: int = 40, points: int = 32) -> Float[np.ndarray, "k m 3"]:
-        """Return sections [K, M, 3] of one blade from inside the hub to the tip.
+        """Return sections [K, M, 3] of one blade, from inside the hub to the tip.
 
-        They are rings of points for `loft`.
+        The sections are rings of points for `loft`.
         """
         # Sections are denser at the tip, because the outline is round there.
         span = np.sin(np.linspace(0, 0.992 * np.pi / 2, spans))[:, None]
@@ -75,7 +75,7 @@ class Propeller:
 
 
 def draw_propeller(rng: np.random.Generator) -> Propeller:
-    """Draw a propeller of three to six blades, from narrow and straight to broad and swept."""
+    """Draw a random propeller with three to six blades, from narrow and straight to broad and swept."""
     blades = int(rng.choice([3, 4, 5, 6], p=[0.2, 0.4, 0.3, 0.1]))
     radius_m = rng.uniform(2.3, 2.8)
     return Propeller(
@@ -94,14 +94,14 @@ def draw_propeller(rng: np.random.Generator) -> Propeller:
 def propeller_mesh(propeller: Propeller, bronze: int, hub: int, bolt: int) -> Mesh:
     """Build the blades, hub, cap and bolts around the origin; one blade points up."""
     blade = loft(propeller.sections_m(), bronze)
-    # Planar texture coordinates, so that the texture is not squeezed at the tip.
+    # Planar texture coordinates keep the texture from being squeezed at the tip.
     blade = replace(blade, uv_m=blade.corners_m[..., 1:].copy())
     around = np.stack([rotation((1, 0, 0), k * 360 / propeller.blades) for k in range(propeller.blades)])
     return join_meshes([copies(blade, around), _hub(propeller, hub), _bolts(propeller, bolt)])
 
 
 def turn_aft(mesh: Mesh) -> Mesh:
-    """Rotate a mesh so that its z axis points along x (aft)."""
+    """Rotate a mesh so that its z axis points aft, along +x."""
     return mesh.transform(rotation((0, 1, 0), 90))
 
 

@@ -1,4 +1,4 @@
-"""Random materials for training, with natural, nearly plain or periodic textures; a fifth are glossy."""
+"""Random materials for training, with natural, nearly plain or periodic textures; some are glossy."""
 
 import colorsys
 
@@ -6,11 +6,11 @@ import numpy as np
 
 from stereoweave.synth.world import Colour, Material
 
-# Shares of texture kinds. Training on natural image statistics transfers to photographs; real rooms are hard
-# because of their plain and periodic surfaces.
+# Fractions of the kinds of texture. Training on natural image statistics transfers to photographs; real rooms
+# are hard because of their plain and periodic surfaces.
 _PHOTOGRAPHS, _PLAIN, _PERIODIC = 0.35, 0.20, 0.12
-# Share of plain surfaces among walls, floors and tables; their middle is farther from texture than a matcher
-# sees.
+# Fraction of plain surfaces among walls, floors and tables. In the middle of such a surface, the nearest
+# texture is outside a matcher's receptive field.
 _BROAD_PLAIN = 0.65
 PERIODIC = ("brick", "tiles", "cloth")
 NATURAL = (
@@ -21,7 +21,7 @@ _TYPICAL_FOCAL_PX = 600
 
 
 def draw_material(rng: np.random.Generator, distance_m: float) -> Material:
-    """Draw a material of any kind, with texels about as fine as pixels when seen from distance_m."""
+    """Draw a random material of any kind, with texels about the size of a pixel when seen from distance_m."""
     family = _draw_family(rng)
     glossy = rng.random() < 0.2
     return Material(
@@ -36,9 +36,9 @@ def draw_material(rng: np.random.Generator, distance_m: float) -> Material:
 
 
 def draw_material_from(rng: np.random.Generator, families: tuple[str, ...], distance_m: float) -> Material:
-    """Draw a dull material from one of the texture families.
+    """Draw a random matt material with a texture from one of the families.
 
-    Its texels are about as fine as pixels when seen from distance_m.
+    Its texels are about the size of a pixel when seen from distance_m.
     """
     family = families[rng.integers(len(families))]
     return Material(
@@ -54,14 +54,14 @@ def draw_material_from(rng: np.random.Generator, families: tuple[str, ...], dist
 
 
 def draw_broad_material(rng: np.random.Generator, families: tuple[str, ...], distance_m: float) -> Material:
-    """Draw a material for a wall, floor or table: mostly plain, otherwise from one of the families."""
+    """Draw a random material for a wall, floor or table, which is usually plain."""
     if rng.random() >= _BROAD_PLAIN:
         return draw_material_from(rng, families, distance_m)
     return Material(
         texture="plain",
         variant=int(rng.integers(1000)),
         tint=draw_muted_colour(rng, 0.3),
-        # The texture is enlarged up to six times, so that little of its contrast remains.
+        # Enlarging the texture up to six times leaves little local contrast.
         span_m=draw_fine_span_m(rng, distance_m) * rng.uniform(1, 6),
         roughness=rng.uniform(0.35, 1.0),
         relief=rng.uniform(0.0, 0.1),
@@ -69,23 +69,23 @@ def draw_broad_material(rng: np.random.Generator, families: tuple[str, ...], dis
 
 
 def draw_fine_span_m(rng: np.random.Generator, distance_m: float) -> float:
-    """Draw the span of a texture in metres.
+    """Draw a random span for a texture, in metres.
 
-    Seen from distance_m, 0.6 to 3 of the texture's 512 texels fall on a pixel.
+    Seen from distance_m, a texture of this span has 0.6 to 3 texels per pixel along each axis.
     """
     across_px = np.exp(rng.uniform(np.log(170), np.log(800)))
     return float(distance_m * across_px / _TYPICAL_FOCAL_PX)
 
 
 def draw_muted_colour(rng: np.random.Generator, saturation: float) -> Colour:
-    """Draw a greyish colour for walls and objects, from dark to almost white."""
+    """Draw a random greyish colour for walls and objects, from dark to almost white."""
     hue = rng.choice([rng.uniform(0.02, 0.16), rng.uniform()], p=[0.6, 0.4])
     red, green, blue = colorsys.hsv_to_rgb(hue, rng.uniform(0, saturation), rng.uniform(0.15, 0.9))
     return red, green, blue
 
 
 def draw_natural_tint(rng: np.random.Generator) -> Colour:
-    """Draw a tint that changes the brightness of a texture but hardly its colour."""
+    """Draw a random tint that changes the brightness of a texture but hardly its colour."""
     red, green, blue = rng.uniform(0.55, 1.0) * rng.uniform(0.88, 1.0, 3)
     return float(red), float(green), float(blue)
 

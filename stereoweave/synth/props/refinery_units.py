@@ -1,4 +1,4 @@
-"""Units of a refinery at a tenth of their real size: columns, tanks, pressure vessels, stacks.
+"""Refinery units at a tenth of their real size: columns, tanks, pressure vessels and stacks.
 
 Each unit stands on z = 0 around the z axis and lists its nozzles.
 """
@@ -24,7 +24,7 @@ from stereoweave.synth.world import Mesh, join_meshes
 
 @dataclass(frozen=True, kw_only=True)
 class RefineryMaterials:
-    """Materials of a refinery; `shells` are the alternatives for the walls of vessels."""
+    """Materials of a refinery; `shells` lists the alternatives for vessel walls."""
 
     shells: tuple[int, ...]
     steel: int
@@ -36,13 +36,13 @@ class RefineryMaterials:
     flame: int
 
     def shell(self, rng: np.random.Generator) -> int:
-        """Draw the material of a shell."""
+        """Return a random material for the walls of a vessel."""
         return self.shells[rng.integers(len(self.shells))]
 
 
 @dataclass(frozen=True, kw_only=True)
 class RefineryUnit:
-    """Mesh of a unit, and the positions [N, 3] of its nozzles."""
+    """Mesh of a unit and positions [N, 3] of its nozzles."""
 
     mesh: Mesh
     nozzles_m: Float[np.ndarray, "n 3"]
@@ -51,7 +51,7 @@ class RefineryUnit:
 def column(rng: np.random.Generator, materials: RefineryMaterials) -> RefineryUnit:
     """Build a distillation column.
 
-    Its skirt carries a shell of one or two widths, with railed platforms and caged ladders.
+    It has a skirt, a shell of one or two diameters, platforms with railings, and caged ladders.
     """
     high_m, radius_m = rng.uniform(2.8, 4.4), rng.uniform(0.16, 0.26)
     upper_m = radius_m * (rng.uniform(0.78, 0.9) if rng.random() < 0.5 else 1.0)
@@ -124,7 +124,7 @@ def ball_tank(rng: np.random.Generator, materials: RefineryMaterials) -> Refiner
 
 
 def drum_tank(rng: np.random.Generator, materials: RefineryMaterials) -> RefineryUnit:
-    """Build a storage tank with a low conical roof, winding stairs, a railing and a number plate."""
+    """Build a storage tank with a low conical roof, winding stairs, a railing and a sign."""
     radius_m, high_m = rng.uniform(0.5, 0.62), rng.uniform(0.6, 1.1)
     seams_m = np.linspace(0, high_m, 5)[1:-1]
     shell = lathe(
@@ -162,9 +162,9 @@ def drum_tank(rng: np.random.Generator, materials: RefineryMaterials) -> Refiner
 
 
 def pressure_vessels(rng: np.random.Generator, materials: RefineryMaterials) -> RefineryUnit:
-    """Build two to four horizontal pressure vessels with round ends on saddles.
+    """Build two to four horizontal pressure vessels with round ends on saddles, in one or two stacks.
 
-    Some are stacked. They have a platform and a ladder.
+    A platform and a ladder give access to the vessels.
     """
     radius_m, long_m = rng.uniform(0.14, 0.2), rng.uniform(0.55, 0.7)
     bend = np.linspace(0, np.pi / 2, 6)[:-1]
@@ -235,7 +235,7 @@ def chimney(rng: np.random.Generator, materials: RefineryMaterials) -> RefineryU
 
 
 def flare(rng: np.random.Generator, materials: RefineryMaterials) -> RefineryUnit:
-    """Build a slender flare stack with guy wires at two heights and, in most draws, a flame."""
+    """Build a slender flare stack with guy wires at two heights and, usually, a flame."""
     high_m = rng.uniform(4.4, 5.4)
     stack = lathe(
         [
@@ -283,7 +283,7 @@ def _flame(rng: np.random.Generator, materials: RefineryMaterials) -> Mesh:
 
 
 def _deck(inner_m: float, wide_m: float, materials: RefineryMaterials) -> Mesh:
-    """Build a round platform with railing and brackets."""
+    """Build a round platform with a railing and brackets."""
     outer_m = inner_m + wide_m
     plate = lathe(
         [[inner_m, -0.02], [outer_m, -0.02], [outer_m, 0.0], [inner_m, 0.0]],
@@ -319,14 +319,14 @@ def _caged_ladder(at_m: float, high_m: float, materials: RefineryMaterials) -> M
 
 
 def _poses_at_heights(heights_m: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 4 4"]:
-    """Return poses [N, 4, 4] at heights on the z axis."""
+    """Return poses [N, 4, 4] at the given heights on the z axis."""
     poses = np.tile(np.eye(4), (len(heights_m), 1, 1))
     poses[:, 2, 3] = heights_m
     return poses
 
 
 def _stair(path_m: Float[np.ndarray, "n 3"], materials: RefineryMaterials) -> Mesh:
-    """Build steps along a path around the z axis, with handrails."""
+    """Build steps along a path around the z axis, with a railing on the outer side."""
     angle = np.arctan2(path_m[:, 1], path_m[:, 0])
     out = np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1)
     turns = np.stack(

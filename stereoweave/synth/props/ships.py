@@ -1,4 +1,4 @@
-"""Random plans of small ships of four trades, and the gear of each trade. The bow is at +x."""
+"""Random plans of tugs, trawlers, coasters and patrol boats, with their gear. The bow is at +x."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,13 +19,13 @@ class ShipPlan:
     """Plan of a ship.
 
     Attributes:
-        hull: the hull.
+        hull: shape of the hull.
         house: deckhouse.
         bridge: wheelhouse on the deckhouse.
-        funnels: x and y of each funnel on the deckhouse.
-        mast_m: x of the mast on the bridge, and the mast's height.
+        funnels: coordinates (x, y) of each funnel on the deckhouse.
+        mast_m: x coordinate and height of the mast on the bridge.
         fenders: whether tyres hang along the sides.
-        build_gear: builds the trade's gear from the ship's materials and the materials of containers.
+        build_gear: function that builds the deck gear; its last argument lists the materials of containers.
     """
 
     hull: Hull
@@ -37,13 +37,13 @@ class ShipPlan:
     build_gear: Callable[[np.random.Generator, "ShipPlan", ShipMaterials, tuple[int, ...]], Mesh]
 
     def on_deck(self, x: float, y: float = 0.0) -> Point:
-        """Return the point on deck at x and y."""
+        """Return the point on the deck at x and y."""
         return np.array([x, y, self.hull.deck_m(x)])
 
 
 @dataclass(frozen=True, kw_only=True)
 class _HullRanges:
-    """Dimensions of one trade's hulls, each fixed or a range; see `Hull`."""
+    """Dimensions of the hulls of one trade, as fixed values or ranges; see `Hull`."""
 
     length_m: Range
     beam_m: Range
@@ -121,7 +121,7 @@ def _draw_hull(rng: np.random.Generator, ranges: _HullRanges) -> Hull:
 
 
 def tug(rng: np.random.Generator) -> ShipPlan:
-    """Draw a short, broad tug, low aft, with tyres all round, a towing winch and a gantry."""
+    """Draw the plan of a short, broad tug, low aft, with tyres all round, a towing winch and a gantry."""
     hull = _draw_hull(rng, _HULLS["tug"])
     high = rng.uniform(0.8, 0.95)
     house = House(
@@ -144,7 +144,7 @@ def tug(rng: np.random.Generator) -> ShipPlan:
 
 
 def trawler(rng: np.random.Generator) -> ShipPlan:
-    """Draw a trawler with a high bow, a derrick on a mast, a gantry aft, a winch and nets."""
+    """Draw the plan of a trawler with a high bow, a derrick on a mast, a gantry aft, a winch and nets."""
     hull = _draw_hull(rng, _HULLS["trawler"])
     at = rng.uniform(-0.2, 0.2)
     house = House(
@@ -166,7 +166,7 @@ def trawler(rng: np.random.Generator) -> ShipPlan:
 
 
 def coaster(rng: np.random.Generator) -> ShipPlan:
-    """Draw a long, low coaster with its deckhouse aft, behind hatches and often containers."""
+    """Draw the plan of a long, low coaster with its deckhouse aft, behind hatches and often containers."""
     hull = _draw_hull(rng, _HULLS["coaster"])
     house = House(
         x_m=(-3.4, -1.95), width_m=1.45, z_m=(hull.deck_m(-1.9) - 0.05, 1.75), lean_m=(0, 0.0, 0.02)
@@ -184,7 +184,7 @@ def coaster(rng: np.random.Generator) -> ShipPlan:
 
 
 def patrol_boat(rng: np.random.Generator) -> ShipPlan:
-    """Draw a slender patrol boat with sloping walls, and an inflatable boat with a crane aft."""
+    """Draw the plan of a slender patrol boat with sloping walls and, aft, an inflatable boat and a crane."""
     hull = _draw_hull(rng, _HULLS["patrol boat"])
     house = House(x_m=(-1.5, 1.7), width_m=1.3, z_m=(hull.deck_m(0.0) - 0.1, 1.35), lean_m=(0.15, 0.7, 0.1))
     bridge = House(x_m=(-0.5, 0.95), width_m=1.15, z_m=(1.39, 2.0), lean_m=(0.1, 0.35, 0.12))

@@ -1,4 +1,4 @@
-"""Dry docks and shipyards: blocks and shores under the hull, scaffolds, work lamps.
+"""Dry docks and shipyards, with blocks and shores under the hull, scaffolds and work lamps.
 
 Aft is +x, and the propeller is at the origin.
 """
@@ -21,7 +21,10 @@ _STEP_M = 0.6
 
 
 def dock(rng: np.random.Generator, palette: Palette, floor_m: float, half_m: float) -> Mesh:
-    """Build a dry dock, 2 half_m wide, with stepped walls and stairs, and with buildings around it."""
+    """Build a dry dock with stepped walls and stairs, and the buildings around it.
+
+    half_m: half the width of the dock's floor.
+    """
     wall, bed, land = (_concrete(rng, palette, tone) for tone in (0.75, 0.65, 0.7))
     rise_m = rng.uniform(1.4, 1.9)
     top_m = floor_m + 4 * rise_m
@@ -65,7 +68,7 @@ def yard(rng: np.random.Generator, palette: Palette, floor_m: float) -> Mesh:
 
 
 def blocks(rng: np.random.Generator, palette: Palette, stern: Stern, floor_m: float) -> Mesh:
-    """Build keel blocks, and timber shores that support the hull."""
+    """Build keel blocks and timber shores that support the hull."""
     concrete = _concrete(rng, palette, 0.6)
     timber = palette.add(
         Material(
@@ -86,7 +89,7 @@ def blocks(rng: np.random.Generator, palette: Palette, stern: Stern, floor_m: fl
 
 
 def scaffold(rng: np.random.Generator, palette: Palette, floor_m: float, high_m: float) -> Mesh:
-    """Build scaffolds with planks and ladders on both sides, forward of the propeller; some have netting."""
+    """Build scaffolds on both sides of the hull, forward of the propeller; some have netting."""
     steel = palette.add(galvanised_steel(rng))
     planks = palette.add(
         Material(
@@ -121,7 +124,7 @@ def scaffold(rng: np.random.Generator, palette: Palette, floor_m: float, high_m:
 
 
 def litter(rng: np.random.Generator, palette: Palette, floor_m: float, half_m: float) -> Mesh:
-    """Build drums, crates, pallets, cones and hoses that lie on the ground, away from the cameras."""
+    """Build drums, crates, pallets, cones and hoses on the ground, away from the cameras."""
     kinds: tuple[Clutter, ...] = (
         surroundings.barrels,
         surroundings.crates,
@@ -141,7 +144,7 @@ def litter(rng: np.random.Generator, palette: Palette, floor_m: float, half_m: f
 
 
 def work_lamps(rng: np.random.Generator, palette: Palette, floor_m: float) -> tuple[Mesh, tuple[Lamp, ...]]:
-    """Build two work lamps on tripods beside the propeller, and return them with their light."""
+    """Build two work lamps on tripods beside the propeller; return the mesh and the light sources."""
     steel = palette.add(Material(texture="paint", tint=vary_colour(rng, (0.22, 0.2, 0.16)), roughness=0.5))
     glass = palette.add(Material(texture="plain", tint=(1.0, 0.97, 0.9), glow=2.5))
     strength = rng.uniform(2, 7)
@@ -160,7 +163,7 @@ def work_lamps(rng: np.random.Generator, palette: Palette, floor_m: float) -> tu
 
 
 def _land(floor_m: float, top_m: float, half_m: float, stern_m: float, material: int) -> Mesh:
-    """Build the ground around the dock from four blocks as deep as the dock."""
+    """Build the ground around the dock from four blocks that extend below the dock's floor."""
     low_m, middle_m = floor_m - 1, (top_m + floor_m - 1) / 2
     deep_m, far_m = top_m - low_m, 110.0
     wide_m = far_m - half_m
@@ -207,9 +210,9 @@ def _stairs(floor_m: float, top_m: float, wall_m: float, steel: int, concrete: i
 
 
 def _tower(rng: np.random.Generator, high_m: float, steel: int, planks: int) -> Mesh:
-    """Build a scaffold of three bays of 1.5 m along y, 0.9 m deep.
+    """Build a scaffold, 0.9 m deep, with three bays of 1.5 m along y.
 
-    It has standards, ledgers, braces, planks and a ladder.
+    It consists of standards, ledgers, braces, planks and a ladder.
     """
     y, x = np.linspace(-2.25, 2.25, 4), np.array([-0.45, 0.45])
     levels = np.arange(0.3, high_m, 1.9)
@@ -236,14 +239,14 @@ def _tower(rng: np.random.Generator, high_m: float, steel: int, planks: int) -> 
 
 
 def _netting(rng: np.random.Generator, high_m: float, cloth: int) -> Mesh:
-    """Build a folded sheet on the front of a scaffold."""
+    """Build netting: a folded sheet on the front of a scaffold."""
     y, z = np.meshgrid(np.linspace(-2.3, 2.3, 28), np.linspace(rng.uniform(0.3, 1.2), high_m - 0.1, 14))
     folds = 0.05 * np.sin(y * rng.uniform(4, 7) + rng.uniform(0, 6)) * np.sin(z * 1.7 + rng.uniform(0, 6))
     return sheet(np.stack([0.53 + abs(folds), y, z], -1), cloth)
 
 
 def _hose_path(rng: np.random.Generator, half_m: float) -> Points:
-    """Draw the path [40, 3] of a hose on the floor."""
+    """Draw a random path [40, 3] for a hose on the floor."""
     share = np.linspace(0, 1, 40)
     sway = sum(rng.normal(0, 0.6) / k * np.sin(k * np.pi * share + rng.uniform(0, 6)) for k in (2, 3, 5))
     ends = rng.uniform(-half_m + 1, half_m - 1, 2)
@@ -252,7 +255,7 @@ def _hose_path(rng: np.random.Generator, half_m: float) -> Points:
 
 
 def _keep_clear_of_ship(spots: Points, half_m: float) -> Points:
-    """Select the spots more than half_m away from the ship's centre line."""
+    """Return the spots more than half_m away from the ship's centre line."""
     return spots[np.abs(spots[:, 1]) > half_m]
 
 

@@ -1,4 +1,4 @@
-"""Random solid objects of about one metre: boxes, balls, vases, twisted prisms, bent pipes."""
+"""Random solid objects about one metre in size, such as boxes, vases, twisted prisms and bent pipes."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,8 +15,8 @@ class PropStyle:
     """Materials and bar thickness of an object.
 
     Attributes:
-        main, other: materials.
-        bar_m: radius of thin bars, for an object of 1 m.
+        main, other: the two materials of the object.
+        bar_m: radius of thin bars in an object 1 m in size.
     """
 
     main: int
@@ -28,7 +28,7 @@ PropBuilder = Callable[[np.random.Generator, PropStyle], Mesh]
 
 
 def box(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """Build a box, flat or tall, with a protruding band at a random height."""
+    """Build a flat or tall box with a protruding band at a random height."""
     size_m = rng.uniform(0.2, 1.0, 3)
     block = boxes(np.zeros(3), size_m, style.main)
     band_m = size_m * np.array([1.03, 1.03, rng.uniform(0.08, 0.3)])
@@ -68,7 +68,7 @@ def cone(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def torus(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """Build a torus, thin or thick."""
+    """Build a thin or thick torus."""
     tube_m = rng.uniform(0.04, 0.17)
     angle = np.linspace(0, 2 * np.pi, 17)
     circle_m = tube_m * np.stack([np.cos(angle), np.sin(angle)], -1)
@@ -76,7 +76,7 @@ def torus(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def vase(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """Build a vase or turned post with a smooth wavy profile."""
+    """Build a vase or turned post with a smooth, wavy profile."""
     share = np.linspace(0, 1, 18)
     waves = sum(rng.uniform(-1, 1) / k * np.cos(np.pi * k * share + rng.uniform(0, 6)) for k in range(1, 6))
     radii_m = rng.uniform(0.12, 0.3) * np.exp(0.45 * waves)
@@ -102,7 +102,7 @@ def bottle(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def lamp(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """Build a floor lamp with foot, rod and shade."""
+    """Build a floor lamp with a foot, a rod and a shade."""
     foot_m, rod_m, low_m = rng.uniform(0.12, 0.22), rng.uniform(0.012, 0.03), rng.uniform(0.55, 0.7)
     stand = np.array([[0, 0], [foot_m, 0], [foot_m, 0.03], [rod_m, 0.06], [rod_m, 0.9], [0.0, 0.9]])
     wide_m, narrow_m = rng.uniform(0.2, 0.32), rng.uniform(0.08, 0.2)
@@ -111,7 +111,7 @@ def lamp(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def twisted_prism(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """Build a twisted, tapering prism of three to six sides."""
+    """Build a twisted, tapering prism with three to six sides."""
     corners, steps = int(rng.integers(3, 7)), 5
     angle = np.arange(corners * steps) / steps
     part = (angle % 1)[:, None]
@@ -132,7 +132,7 @@ def bent_pipe(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def blob(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """Build a boulder, a sphere with smooth bumps."""
+    """Build a boulder: a sphere with smooth bumps."""
     polar, around = np.linspace(3.12, 0.02, 24)[:, None], np.arange(36) * 2 * np.pi / 36
     radius_m = 0.4 + np.sum(
         [
@@ -147,12 +147,12 @@ def blob(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def plate(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """Build a thin flat board."""
+    """Build a thin, flat board."""
     return boxes(np.zeros(3), np.array([rng.uniform(0.4, 1.0), rng.uniform(0.01, 0.04), 1.0]), style.main)
 
 
 def bowl(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """Build an open bowl, deep or shallow."""
+    """Build a deep or shallow bowl."""
     depth_m, angle = rng.uniform(0.12, 0.4), np.linspace(0.05, np.pi / 2, 10)
     outside = np.stack([0.5 * np.sin(angle), depth_m * (1 - np.cos(angle))], -1)
     inside = outside[::-1] * [0.94, 0.94] + [0, 0.06 * depth_m]
@@ -170,7 +170,7 @@ def dumbbell(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def cloth(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """Build a wavy sheet of cloth, hanging or flying."""
+    """Build a wavy sheet of cloth."""
     x, z = np.meshgrid(np.linspace(-0.5, 0.5, 36), np.linspace(0, rng.uniform(0.6, 1.1), 26))
     y = sum(
         rng.uniform(0.01, 0.12) / np.sqrt(k) * np.sin(k * rng.uniform(2, 6) * x + rng.normal(0, 3) * z)
@@ -180,7 +180,7 @@ def cloth(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def arch(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """Build an arch, half a ring on two posts."""
+    """Build an arch: half a ring on two posts."""
     angle, radius_m, leg_m = np.linspace(0, np.pi, 24), rng.uniform(0.25, 0.45), rng.uniform(0.1, 0.5)
     bend = np.stack([radius_m * np.cos(angle), 0 * angle, leg_m + radius_m * np.sin(angle)], -1)
     path_m = np.concatenate([[[radius_m, 0, 0]], bend, [[-radius_m, 0, 0]]])
@@ -188,7 +188,7 @@ def arch(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def stairs(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """Build stairs of stacked blocks."""
+    """Build stairs of blocks of increasing height."""
     count = int(rng.integers(4, 9))
     step_m, wide_m = 1.0 / count, rng.uniform(0.3, 0.8)
     k = np.arange(count)
@@ -215,7 +215,7 @@ def tower_of_blocks(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def wander_m(rng: np.random.Generator, count: int) -> Float[np.ndarray, "n 3"]:
-    """Draw a smooth random path of about one metre."""
+    """Draw a smooth, random path about one metre in size."""
     share = np.linspace(0, 1, count)[:, None]
     waves = sum(
         rng.normal(0, 0.22 / k, 3) * np.sin(np.pi * k * share + rng.uniform(0, 6, 3)) for k in (1, 2, 3)

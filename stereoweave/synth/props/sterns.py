@@ -1,4 +1,4 @@
-"""Stern of a large ship above its propeller: hull, skeg or bracket, shaft, rudder. Aft is +x."""
+"""Sterns of large ships, with a hull, a skeg or bracket, a shaft and a rudder. Aft is +x."""
 
 from dataclasses import dataclass
 
@@ -37,7 +37,7 @@ class Stern:
     def side_m(self, x: np.ndarray, z: np.ndarray, side: float) -> Points:
         """Return points on the hull's skin near x and z.
 
-        side: 1 for the side at +y, -1 for the one at -y.
+        side: 1 for the side at +y, -1 for the side at -y.
         """
         share = (self.end_m - x) / _LENGTH_M
         at = self.hull.side_m(share, z - self.water_m, -side)
@@ -45,7 +45,7 @@ class Stern:
 
 
 def stern(rng: np.random.Generator, palette: Palette, propeller: Propeller) -> Stern:
-    """Build a hull above the propeller, with a skeg or a bracket and, at times, a rudder."""
+    """Build a hull above the propeller, with a skeg or a bracket and, sometimes, a rudder."""
     bottom = palette.add(_coat(rng, _BOTTOMS))
     stripe = palette.add(_coat(rng, ((0.75, 0.75, 0.72), (0.6, 0.5, 0.15))))
     topside = palette.add(_coat(rng, _SIDES))
@@ -96,7 +96,7 @@ def _shaft(rng: np.random.Generator) -> Material:
 
 
 def _skeg(sole: Stern, propeller: Propeller, material: int) -> Mesh:
-    """Build the skeg below the hull, with the boss of the shaft."""
+    """Build the skeg below the hull, with a boss around the shaft."""
     after_m = -propeller.hub_half_m - 0.25
     away = np.linspace(0, 1, 30)[::-1, None] ** 1.5
     x = after_m - 13 * away
@@ -112,7 +112,7 @@ def _skeg(sole: Stern, propeller: Propeller, material: int) -> Mesh:
 
 
 def _bracket(propeller: Propeller, clear_m: float, material: int, steel: int) -> Mesh:
-    """Build a shaft bracket of two struts, and the exposed shaft."""
+    """Build a shaft bracket with two struts, and the exposed shaft."""
     r, front_m = propeller.hub_m, -propeller.hub_half_m - 0.05
     profile = [
         (0, -1.5),
@@ -135,14 +135,14 @@ def _bracket(propeller: Propeller, clear_m: float, material: int, steel: int) ->
 
 
 def _collar(propeller: Propeller, material: int) -> Mesh:
-    """Build the rope guard between hub and bearing."""
+    """Build the rope guard between the hub and the bearing."""
     r = 0.95 * propeller.hub_m
     ring = [(0.5 * r, 0), (1.05 * r, 0), (1.05 * r, 0.3), (0.9 * r, 0.33), (0.5 * r, 0.33)]
     return turn_aft(lathe(ring, material, 40)).translate(x=-propeller.hub_half_m - 0.35)
 
 
 def _rudder(rng: np.random.Generator, propeller: Propeller, clear_m: float, material: int, zinc: int) -> Mesh:
-    """Build a rudder with its stock, turned by a random angle."""
+    """Build a rudder and its stock, turned by a random angle."""
     chord_m = rng.uniform(0.95, 1.3)
     foot_m, head_m = -rng.uniform(0.45, 0.75) * propeller.radius_m, clear_m - 0.25
     angle = np.linspace(0, 2 * np.pi, 40, endpoint=False)

@@ -1,4 +1,4 @@
-"""Streets along x: carriageway, house fronts, vehicles, people, street furniture."""
+"""Streets along x, with a carriageway, house fronts, vehicles, people and street furniture."""
 
 from dataclasses import dataclass
 
@@ -26,7 +26,7 @@ class StreetPlan:
     Attributes:
         half_m: half the width of the carriageway.
         pavement_m: width of each pavement.
-        lane_m: y of the cameras' lane.
+        lane_m: y coordinate of the cameras' lane.
     """
 
     half_m: float
@@ -40,7 +40,7 @@ class StreetPlan:
 
 
 def draw_street_plan(rng: np.random.Generator) -> StreetPlan:
-    """Draw a street with one lane each way and parking; traffic keeps right or left."""
+    """Draw a random street plan with parking and one lane each way; traffic keeps right or left."""
     half_m = rng.uniform(4.2, 6.5)
     side = float(rng.choice([-1.0, 1.0], p=[0.75, 0.25]))
     return StreetPlan(half_m=half_m, pavement_m=rng.uniform(1.6, 4.0), lane_m=side * (half_m - 2.1) / 2)
@@ -74,7 +74,7 @@ def carriageway(rng: np.random.Generator, palette: Palette, plan: StreetPlan) ->
 def fronts(rng: np.random.Generator, palette: Palette, plan: StreetPlan) -> Mesh:
     """Build two rows of houses with some gaps.
 
-    In some draws, a fence with bushes and trees takes the place of one row.
+    Sometimes, a fence with bushes and trees replaces one row.
     """
     walls = [palette.add(draw_material_from(rng, _FRONTS, 12.0)) for _ in range(6)]
     glass = palette.add(Material(texture="plain", tint=(0.07, 0.09, 0.11), roughness=0.08))
@@ -101,7 +101,8 @@ def fronts(rng: np.random.Generator, palette: Palette, plan: StreetPlan) -> Mesh
 def traffic(rng: np.random.Generator, palette: Palette, plan: StreetPlan) -> Mesh:
     """Build parked and moving vehicles.
 
-    Parked ones stand along both kerbs. At most one drives ahead of the cameras, and up to two are oncoming.
+    Vehicles are parked along both kerbs. At most one vehicle drives ahead of the cameras, and up to two are
+    oncoming.
     """
     kinds = [*fleet(rng, palette), *fleet(rng, palette)[:2]]
     cars = [kinds[k] for k in (0, 1, 4, 5)]
@@ -140,7 +141,7 @@ def walkers(rng: np.random.Generator, palette: Palette, plan: StreetPlan) -> Mes
 
 
 def street_furniture(rng: np.random.Generator, palette: Palette, plan: StreetPlan) -> Mesh:
-    """Build lamp posts and signs on the pavements and, in some draws, bollards, trees and wires."""
+    """Build lamp posts and signs on the pavements and, sometimes, bollards, trees and wires."""
     steel = palette.add(galvanised_steel(rng))
     signs = [palette.add(draw_material_from(rng, ("sign", "paint", "plain"), 6.0)) for _ in range(2)]
     at_m = np.arange(rng.uniform(-8, 4), 80, rng.uniform(12, 26))
@@ -181,7 +182,7 @@ def _house(
 ) -> Mesh:
     """Build a house that extends from the origin along x and y, with its front at y = 0.
 
-    The front has windows above doors or shops.
+    On the ground floor, the front has shop windows, or a door and windows. The other floors have windows.
     """
     length_m, deep_m, high_m = (float(v) for v in size_m)
     block = boxes([[length_m / 2, deep_m / 2, high_m / 2 - 0.3]], [[length_m, deep_m, high_m + 0.6]], wall)
@@ -203,7 +204,10 @@ def _house(
 
 
 def _panes(spots_m: list[tuple[float, float]], width_m: float, high_m: float, glass: int, trim: int) -> Mesh:
-    """Build windows at (x, z) of a front; frames protrude from the wall, and panes from the frames."""
+    """Build windows at points (x, z) on a house front.
+
+    The frames protrude from the wall, and the panes protrude from the frames.
+    """
     centres = np.array([[x, 0, z] for x, z in spots_m])
     frames = boxes(centres, [width_m + 0.2, 0.1, high_m + 0.2], trim)
     panes = boxes(centres, [width_m, 0.16, high_m], glass)
@@ -239,7 +243,7 @@ def _lamp_post(x: float, y: float, inwards: float, steel: int) -> Mesh:
 
 
 def _wires(rng: np.random.Generator, at_m: Float[np.ndarray, " n"], y: float, steel: int) -> Mesh:
-    """Build one to four wires that sag from post to post."""
+    """Build one to four wires that sag between posts."""
     share = np.linspace(0, 1, 9)
     sag_m = rng.uniform(0.2, 0.6)
     wires = []
@@ -258,7 +262,7 @@ def _sign(rng: np.random.Generator, steel: int, faces: list[int]) -> Mesh:
     angle = np.arange(corners) * 2 * np.pi / corners + np.pi / 2
     outline = half_m * np.stack([np.cos(angle), np.sin(angle)], -1)
     plate = prism(outline, 0.02, faces[int(rng.integers(len(faces)))])
-    # Map the outline's x, y and z to across the street, up, and towards the traffic.
+    # This turns the x axis of the outline across the street, y upwards and z towards the traffic.
     facing = np.array([[0.0, 0, -1, -0.06], [-1, 0, 0, 0], [0, 1, 0, high_m - half_m], [0, 0, 0, 1]])
     post = tubes([[0, 0, 0]], [[0, 0, high_m]], 0.035, steel, 8)
     return join_meshes([post, plate.transform(rotation((0, 0, 1), rng.normal(0, 8)) @ facing)])

@@ -1,7 +1,7 @@
-"""Surroundings of the targets: daylight, ground, water, trees, houses, and goods of yards and quays.
+"""Surroundings of the targets: daylight, ground, water, trees, houses, and goods in yards and on quays.
 
-Each function adds its materials to the palette. Objects stand at their spots, usually at z = 0, and most
-extend slightly below, so that uneven ground hides their feet.
+Functions that build meshes add their materials to the palette. Objects stand at the given spots, usually at
+z = 0. Most objects extend slightly below the ground, so no gaps show where the ground is uneven.
 """
 
 from collections.abc import Sequence
@@ -38,7 +38,7 @@ _GROUND_TINTS: dict[str, tuple[Colour, float]] = {  # tint, and span of the text
 
 
 def daylight(rng: np.random.Generator) -> Daylight:
-    """Draw the light of a clear, hazy or overcast day, or of a low warm sun."""
+    """Draw random daylight: a clear, hazy or overcast sky, or a low, warm sun."""
     kind = rng.choice(["clear", "hazy", "overcast", "low"], p=[0.4, 0.25, 0.15, 0.2])
     height_deg = rng.uniform(15, 26) if kind == "low" else rng.uniform(30, 65)
     azimuth, height = rng.uniform(0, 2 * np.pi), np.radians(height_deg)
@@ -74,10 +74,9 @@ def terrain(  # noqa: PLR0913 - family and dimensions
     bumps_m: float = 0.3,
     flat_radius_m: float = 5.0,
 ) -> Mesh:
-    """Build ground that extends extent_m to each side, flat around the origin and bumpy farther out.
+    """Build ground that extends extent_m in each direction, flat around the origin and bumpy farther out.
 
-    family: texture family, one of "grass", "soil", "gravel", "asphalt", "concrete", or "plain" for sand and
-    snow.
+    family: texture family "grass", "soil", "gravel", "asphalt", "concrete", or "plain" for sand and snow.
     """
     tint, span_m = _GROUND_TINTS[family]
     material = palette.add(
@@ -103,7 +102,7 @@ def terrain(  # noqa: PLR0913 - family and dimensions
 
 
 def sea(rng: np.random.Generator, palette: Palette, *, extent_m: float = 200.0, level_m: float = 0.0) -> Mesh:
-    """Build water that extends extent_m to each side, with the highest waves near the origin."""
+    """Build water that extends extent_m in each direction, with the highest waves near the origin."""
     tint: Colour = [(0.7, 0.75, 0.75), (0.8, 0.8, 0.65), (0.9, 0.8, 0.75)][int(rng.integers(3))]
     material = palette.add(
         Material(
@@ -120,7 +119,7 @@ def sea(rng: np.random.Generator, palette: Palette, *, extent_m: float = 200.0, 
     height = np.full_like(x, level_m)
     for length in np.geomspace(2.2, 16, 8) * rng.uniform(0.9, 1.1, 8):
         way, phase = wind + rng.normal(0, 0.5), rng.uniform(0, 6)
-        # The grid coarsens outwards and cannot represent short waves there.
+        # Far from the origin, the grid is too coarse to represent short waves.
         carried = np.clip(1.5 - np.maximum(abs(x), abs(y)) * 0.2 / length, 0, 1)
         wave = np.sin((x * np.cos(way) + y * np.sin(way)) * 2 * np.pi / length + phase)
         height += 0.008 * roughness_m * length * carried * wave
@@ -182,7 +181,7 @@ def trees(
 
 
 def bushes(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
-    """Build bushes at the spots, about 0.5 to 2 m high."""
+    """Build bushes, about 0.5 to 2 m high, at the spots."""
     leaves = _add_foliage(rng, palette)
     middles = rng.uniform((-0.35, -0.35, 0.2), (0.35, 0.35, 0.6), (2, 3, 3))
     shapes = [_lumps(rng, places, (0.42, 0.42, 0.38), leaves) for places in middles]
@@ -191,7 +190,7 @@ def bushes(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
 
 
 def rocks(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
-    """Build boulders at the spots, about 0.3 to 1.5 m across and half sunk."""
+    """Build half-buried boulders, about 0.3 to 1.5 m across, at the spots."""
     stone = palette.add(Material(texture="stone", variant=int(rng.integers(64)), relief=0.7, roughness=0.9))
     kinds = [_lumps(rng, np.zeros((1, 3)), rng.uniform(0.3, 0.55, 3), stone) for _ in range(3)]
     return _scatter(rng, kinds, spots, rng.uniform(0.4, 1.5, len(spots)))
@@ -248,7 +247,7 @@ def pallets(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
 
 
 def barrels(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
-    """Build steel drums at the spots, painted or rusty and 0.9 m high."""
+    """Build painted and rusty steel drums, 0.9 m high, at the spots."""
     profile = [(0, 0), (0.29, 0), (0.29, 0.3), (0.305, 0.31), (0.29, 0.32), (0.29, 0.58), (0.305, 0.59)]
     profile += [(0.29, 0.6), (0.29, 0.88), (0.27, 0.88), (0.27, 0.86), (0, 0.86)]
     kinds = [
@@ -259,7 +258,7 @@ def barrels(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
 
 
 def bollards(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
-    """Build iron mooring bollards at the spots, 0.55 m high."""
+    """Build iron mooring bollards, 0.55 m high, at the spots."""
     iron = palette.add(Material(texture="rust", variant=int(rng.integers(64)), tint=(0.75, 0.72, 0.7)))
     profile = [
         (0, 0),
@@ -275,7 +274,7 @@ def bollards(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
 
 
 def cones(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
-    """Build traffic cones with a white band at the spots, 0.55 m high."""
+    """Build traffic cones with a white band, 0.55 m high, at the spots."""
     orange = palette.add(Material(texture="plain", tint=(0.8, 0.2, 0.06), roughness=0.6))
     white = palette.add(Material(texture="plain", tint=(0.85, 0.85, 0.85), roughness=0.5))
     below = lathe([(0.14, 0.03), (0.1, 0.2)], orange, 16)
@@ -288,7 +287,7 @@ def cones(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
 def _scatter(
     rng: np.random.Generator, kinds: Sequence[Mesh], spots: Spots, scales: Float[np.ndarray, " n"]
 ) -> Mesh:
-    """Put one of the kinds at each spot, scaled and randomly rotated about z."""
+    """Put a random kind of object at each spot, scaled and randomly rotated about z."""
     which = rng.integers(len(kinds), size=len(spots))
     angle = rng.uniform(0, 2 * np.pi, len(spots))
     poses = np.tile(np.eye(4), (len(spots), 1, 1))
@@ -303,7 +302,7 @@ def _scatter(
 def _widening_grid(extent_m: float, near_m: float, steps: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the x and y coordinates of a grid, each [steps + 1, steps + 1].
 
-    The grid is fine within near_m of the origin and coarser outwards.
+    The grid is fine within near_m of the origin and coarser farther out.
     """
     end = np.arcsinh(extent_m / near_m)
     axis = near_m * np.sinh(np.linspace(-end, end, steps + 1))
@@ -312,7 +311,7 @@ def _widening_grid(extent_m: float, near_m: float, steps: int) -> tuple[np.ndarr
 
 
 def _map_texture_from_above(mesh: Mesh) -> Mesh:
-    """Project the mesh's texture from above."""
+    """Return the mesh with its texture projected from above."""
     return replace(mesh, uv_m=mesh.corners_m[..., :2].copy())
 
 
@@ -342,7 +341,7 @@ def _tree(rng: np.random.Generator, bark: int, leaves: int, spread: float) -> Me
 
 
 def _fir(rng: np.random.Generator, bark: int, leaves: int) -> Mesh:
-    """Build a fir of height 1, with stacked skirts of needles."""
+    """Build a fir of height 1, with tiers of needles."""
     trunk = tubes([[0, 0, -0.1]], [[0, 0, 0.9]], np.array([[0.022, 0.005]]), bark, 6)
     skirts = []
     for z in np.linspace(0.15, 0.8, 6):
@@ -363,7 +362,7 @@ def _lumps(
 
 
 def _tufts(rng: np.random.Generator, crown: Mesh, count: int, size_m: float) -> Mesh:
-    """Build twigs, one triangle each, that roughen the outline of a crown."""
+    """Build tufts, each a single triangle, that roughen the outline of a crown."""
     pick = rng.integers(len(crown.material), size=count)
     normals = crown.normals[pick].mean(1, keepdims=True)
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
@@ -376,7 +375,7 @@ def _tufts(rng: np.random.Generator, crown: Mesh, count: int, size_m: float) -> 
 
 
 def _perturb(rng: np.random.Generator, mesh: Mesh, share: float) -> Mesh:
-    """Displace the vertices by up to a share of the mesh's size, and roughen the normals."""
+    """Displace the vertices randomly, in proportion to the size of the mesh, and roughen the normals."""
     corners = mesh.corners_m
     size = np.ptp(corners.reshape(-1, 3), axis=0).max() / 2
     # Coincident vertices move together, because the displacement depends on the position alone.
@@ -424,7 +423,7 @@ def _gabled_walls(length: float, width: float, eaves: float, rise: float, materi
 
 
 def _roof(length: float, width: float, eaves: float, rise: float, material: int) -> Mesh:
-    """Build two slabs that overhang the walls by 0.4 m."""
+    """Build a roof of two slabs that overhang the walls by 0.4 m."""
     slope = np.arctan2(rise, width / 2)
     across = width / 2 / np.cos(slope) + 0.4
     turns = np.stack([rotation((1, 0, 0), side * np.degrees(slope))[:3, :3] for side in (1, -1)])
@@ -433,9 +432,9 @@ def _roof(length: float, width: float, eaves: float, rise: float, material: int)
 
 
 def _openings(size_m: tuple[float, float, float], columns: int, glass: int, frame: int) -> Mesh:
-    """Build rows of windows on the long walls and the gables, and a door.
+    """Build a door, and rows of windows on the long walls and the gables.
 
-    size_m: length, width, and height of the eaves.
+    size_m: length and width of the house, and height of the eaves.
     """
     length, width, eaves = size_m
     floors = np.arange(1.5, eaves - 0.6, 2.6)
@@ -446,7 +445,7 @@ def _openings(size_m: tuple[float, float, float], columns: int, glass: int, fram
         [np.stack([x, side * width / 2, z], -1), np.stack([end * length / 2, y, z2], -1)]
     )
     thin = np.concatenate([np.tile([1.0, 0.1, 1.2], (len(x), 1)), np.tile([0.1, 1.0, 1.2], (len(y), 1))])
-    # Panes protrude more than frames, and glazing bars more than panes, which avoids z-fighting.
+    # To avoid z-fighting, panes protrude more than frames, and glazing bars protrude more than panes.
     frames = boxes(centres, thin + np.where(thin < 0.5, 0.0, 0.2), frame)
     panes = boxes(centres, np.where(thin < 0.5, 0.16, thin), glass)
     bars = boxes(centres, np.where(thin < 0.5, 0.22, [0.06, 0.06, 1.2]), frame)
@@ -455,7 +454,7 @@ def _openings(size_m: tuple[float, float, float], columns: int, glass: int, fram
 
 
 def _crate(wood: int, frame: int) -> Mesh:
-    """Build a crate of 1 m with battens along its edges."""
+    """Build a crate, 1 m in size, with battens along its edges."""
     ends = np.array([(a, b) for a in (-0.47, 0.47) for b in (0.03, 0.97)])
     along_x = boxes(np.insert(ends, 0, 0, axis=1), (1.02, 0.1, 0.1), frame)
     along_y = boxes(np.insert(ends, 1, 0, axis=1), (0.1, 1.02, 0.1), frame)
@@ -480,6 +479,6 @@ def _scale_colour(colour: Colour, factor: float) -> Colour:
 
 
 def vary_colour(rng: np.random.Generator, colour: Colour) -> Colour:
-    """Vary the brightness and temperature of a colour slightly."""
+    """Vary the brightness and the temperature of a colour randomly, by small amounts."""
     red, green, blue = np.array(colour) * rng.uniform(0.85, 1.1) * rng.uniform(0.96, 1.04, 3)
     return float(red), float(green), float(blue)

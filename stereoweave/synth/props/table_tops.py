@@ -1,4 +1,4 @@
-"""Tables close to the cameras, with upright boards and a wall close behind.
+"""Tables close to the cameras, with upright boards and a wall close behind them.
 
 The cameras are towards +x, the centre of their view is above the origin, and the floor is at z = 0.
 """
@@ -23,9 +23,9 @@ class TableTop:
     """Dimensions of a table.
 
     Attributes:
-        distance_m: distance from the cameras to the centre.
+        distance_m: distance from the cameras to the centre of the view.
         height_m: height of the table's surface.
-        behind_m: distance from the centre to the wall behind, where the table ends.
+        behind_m: distance from the centre to the wall, where the table ends.
         before_m: distance from the centre to the front edge.
         width_m: width of the table across the view.
     """
@@ -38,7 +38,7 @@ class TableTop:
 
 
 def draw_table_top(rng: np.random.Generator) -> TableTop:
-    """Draw the dimensions of a table, which in most draws fills the image's width."""
+    """Draw random dimensions for a table, which usually fills the width of the image."""
     distance_m = rng.uniform(1.5, 2.3)
     return TableTop(
         distance_m=distance_m,
@@ -50,7 +50,7 @@ def draw_table_top(rng: np.random.Generator) -> TableTop:
 
 
 def table_top(rng: np.random.Generator, palette: Palette, sizes: TableTop) -> Mesh:
-    """Build a table with up to three boards and, in nine of ten draws, one or two walls behind."""
+    """Build a table with up to three boards and, in nine cases out of ten, one or two walls behind it."""
     parts = [_table(rng, palette, sizes), *_boards(rng, palette, sizes)]
     if rng.random() < 0.9:
         parts.append(_backdrop(rng, palette, sizes))
@@ -58,7 +58,7 @@ def table_top(rng: np.random.Generator, palette: Palette, sizes: TableTop) -> Me
 
 
 def _table(rng: np.random.Generator, palette: Palette, sizes: TableTop) -> Mesh:
-    """Build a slab on a narrower plinth."""
+    """Build a table: a slab on a narrower plinth."""
     material = palette.add(draw_broad_material(rng, _TOPS, sizes.distance_m))
     length_m = sizes.behind_m + sizes.before_m
     x = (sizes.before_m - sizes.behind_m) / 2
@@ -69,7 +69,7 @@ def _table(rng: np.random.Generator, palette: Palette, sizes: TableTop) -> Mesh:
 
 
 def _boards(rng: np.random.Generator, palette: Palette, sizes: TableTop) -> list[Mesh]:
-    """Build up to three slightly leaning boards of at most two materials."""
+    """Build up to three slightly leaning boards in at most two materials."""
     materials = [palette.add(draw_broad_material(rng, _BOARDS, sizes.distance_m)) for _ in range(2)]
     boards = []
     for _ in range(int(rng.integers(0, 4))):
@@ -83,7 +83,7 @@ def _boards(rng: np.random.Generator, palette: Palette, sizes: TableTop) -> list
 
 
 def _backdrop(rng: np.random.Generator, palette: Palette, sizes: TableTop) -> Mesh:
-    """Build a wall across the view and, in some draws, a side wall at right angles to it."""
+    """Build a wall across the view and, sometimes, a side wall at right angles to it."""
     material = palette.add(draw_broad_material(rng, _BACKDROPS, sizes.distance_m + sizes.behind_m))
     wide_m, high_m = sizes.distance_m * rng.uniform(1.4, 3.0), rng.uniform(1.3, 2.4)
     wall = boxes([[-0.03, 0, high_m / 2]], [[0.06, wide_m, high_m]], material)

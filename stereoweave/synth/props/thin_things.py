@@ -1,4 +1,4 @@
-"""Random thin objects of about one metre: rods, frames, lattices, fences, wheels, springs."""
+"""Random thin objects about one metre in size, such as rods, lattices, fences, wheels and springs."""
 
 import itertools
 
@@ -18,7 +18,7 @@ def rods(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def bundle(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """Build a bundle of slightly spreading bars, like reeds or a broom."""
+    """Build a bundle of slightly spreading bars, such as reeds or a broom."""
     count = int(rng.integers(10, 40))
     feet_m = np.column_stack([rng.normal(0, 0.1, (count, 2)), np.zeros(count)])
     spread = np.column_stack([rng.normal(0, 0.15, (count, 2)), rng.uniform(0.6, 1.0, count)])
@@ -26,7 +26,7 @@ def bundle(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def wire_frame(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """Build the edges and some face diagonals of a box, with balls at its corners."""
+    """Build the edges and some face diagonals of a box, with balls at the corners."""
     corners = np.array(list(itertools.product((-0.5, 0.5), repeat=3))) * rng.uniform(0.4, 1.0, 3)
     apart = [(a, b) for a in range(8) for b in range(a) if (a ^ b).bit_count() <= rng.integers(1, 3)]
     pairs = np.array(apart)
@@ -58,7 +58,7 @@ def thin_fence(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def wheel(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """Build a rim with a hub and spokes."""
+    """Build a wheel with a rim, a hub and spokes."""
     angle = np.linspace(0, 2 * np.pi, 37)
     rim_m = 0.48 * np.stack([np.cos(angle), 0 * angle, np.sin(angle)], -1)
     spokes = rim_m[: -1 : int(rng.choice([1, 2, 3, 6]))]
@@ -95,14 +95,14 @@ def branch(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def loose_wires(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """Build wires along similar random curves."""
+    """Build two to four wires along similar random curves."""
     main_m = wander_m(rng, 20)
     aside_m = rng.normal(0, 0.08, (int(rng.integers(2, 5)), 1, 3)) * np.linspace(0.2, 1, 20)[:, None]
     return join_meshes(sweep(main_m + aside, style.bar_m, style.main, 6) for aside in aside_m)
 
 
 def mobile(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """Build a bar from which balls hang on threads."""
+    """Build a mobile: a bar with balls that hang on threads."""
     count = int(rng.integers(3, 9))
     x, drop_m = np.linspace(-0.45, 0.45, count), rng.uniform(0.15, 0.9, count)
     lower = _points(x, -drop_m)

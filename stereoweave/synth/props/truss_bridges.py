@@ -1,4 +1,4 @@
-"""Steel truss bridges, fixed or lifting. The road runs along x."""
+"""Fixed and lifting steel truss bridges. The road runs along x."""
 
 import numpy as np
 from jaxtyping import Float
@@ -29,7 +29,7 @@ def truss_bridge(rng: np.random.Generator, palette: Palette, plan: BridgePlan) -
 
 
 def lift_bridge(rng: np.random.Generator, palette: Palette, plan: BridgePlan) -> Mesh:
-    """Build a lift bridge: a truss span between two lattice towers, raised in some draws.
+    """Build a lift bridge: a truss span, sometimes raised, between two lattice towers.
 
     The towers have counterweights, ropes and sheaves.
     """
@@ -55,9 +55,11 @@ def lift_bridge(rng: np.random.Generator, palette: Palette, plan: BridgePlan) ->
 def _span(  # noqa: PLR0913 - dimensions
     rng: np.random.Generator, plan: BridgePlan, length_m: float, panels: int, height_m: float, crown: float
 ) -> Mesh:
-    """Build two trusses, bracing over the road and beams under it, around x = 0; the road is at z = 0.
+    """Build two trusses, with bracing over the road and beams under it.
 
-    crown: additional height in the middle, as a share of the height.
+    The span is centred on x = 0, and the road is at z = 0.
+
+    crown: curvature of the upper chords; 0 makes them straight.
     """
     x = np.linspace(-length_m / 2, length_m / 2, panels + 1)
     share = x[1:-1] / x[-1]
@@ -105,7 +107,7 @@ def _plane(plan: BridgePlan, low: Joints, top: Joints, braced: str) -> Mesh:
 def _lift_tower(plan: BridgePlan, height_m: float, raised_m: float, concrete: int) -> Mesh:
     """Build a tower around the road, next to a lift span at smaller x.
 
-    Its counterweight is down when the span is up.
+    The higher the span is raised, the lower the counterweight hangs.
     """
     z = np.linspace(-0.12, height_m, 9)
     frame = truss(mast_rings(z, _TOWER_M, 4) * [1, 2 * plan.side_m / _TOWER_M, 1], "cross")

@@ -1,4 +1,4 @@
-"""Cars, lorries and buses at real size, pointing along x and standing on z = 0."""
+"""Full-size cars, lorries and buses, facing +x and standing on z = 0."""
 
 import numpy as np
 
@@ -73,7 +73,7 @@ def _bus(paint: int, glass: int, tyre: int) -> Mesh:
 
 
 def _extrude(outline_m: list[tuple[float, float]], width_m: float, material: int) -> Mesh:
-    """Extrude a side view (x, z) to both sides."""
+    """Extrude an outline in x and z by half of width_m to each side."""
     return prism(outline_m, width_m, material).transform(rotation((1, 0, 0), 90)).translate(y=width_m / 2)
 
 

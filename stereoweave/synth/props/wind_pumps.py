@@ -1,4 +1,4 @@
-"""Wind pumps: a wheel of sheet-iron blades with a tail on a lattice tower, and a water tank."""
+"""Wind pumps with a wheel of sheet-iron blades, a tail, a lattice tower and a water tank."""
 
 from typing import NamedTuple
 
@@ -21,7 +21,7 @@ from stereoweave.synth.world import Material, Mesh, join_meshes
 
 
 class WindPump(NamedTuple):
-    """Wind pump around the z axis, with its wheel towards +x.
+    """Wind pump around the z axis, with its wheel facing +x.
 
     Attributes:
         mesh: wheel, tail, tower and tank.
@@ -33,7 +33,7 @@ class WindPump(NamedTuple):
 
 
 def wind_pump(rng: np.random.Generator, palette: Palette) -> WindPump:
-    """Draw a wind pump about 5 m high."""
+    """Build a random wind pump about 5 m high."""
     steel = palette.add(galvanised_steel(rng))
     blades = palette.add(
         galvanised_steel(rng) if rng.random() < 0.6 else painted_steel(rng, (0.7, 0.68, 0.62))
@@ -53,7 +53,7 @@ def wind_pump(rng: np.random.Generator, palette: Palette) -> WindPump:
 
 
 def _wheel(rng: np.random.Generator, radius_m: float, skins: tuple[int, int, int]) -> Mesh:
-    """Build a wheel around x, with angled curved blades, two rings, spokes and a hub."""
+    """Build a wheel around the x axis, with angled, curved blades, two rings, spokes and a hub."""
     blades, marked, steel = skins
     count = int(rng.choice([12, 15, 18]))
     share = np.linspace(0, 1, 5)[:, None]
@@ -85,7 +85,7 @@ def _wheel(rng: np.random.Generator, radius_m: float, skins: tuple[int, int, int
 
 
 def _tail(rng: np.random.Generator, radius_m: float, skins: tuple[int, int]) -> Mesh:
-    """Build the gear case, boom and vane."""
+    """Build the gear case, the boom and the vane."""
     vane, steel = skins
     end = -1.25 * radius_m
     half = rng.uniform(0.26, 0.34)
@@ -111,7 +111,7 @@ def _tail(rng: np.random.Generator, radius_m: float, skins: tuple[int, int]) -> 
 
 
 def _tower(top_m: float, steel: int, rust: int) -> Mesh:
-    """Build a tower of four braced legs, with platform, railing, ladder, pump rod and footings."""
+    """Build a tower of four braced legs, with a platform, a railing, a ladder, a pump rod and footings."""
     joints = mast_rings(*mast_levels((0.0, top_m), (1.3, 0.14), 0.9))
     deck = 0.86 * top_m
     rim = 0.28 * np.array([[1, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0], [1, 1, 0]])
@@ -129,7 +129,7 @@ def _tower(top_m: float, steel: int, rust: int) -> Mesh:
 
 
 def _tank(rng: np.random.Generator, palette: Palette, steel: int, rust: int) -> Mesh:
-    """Build a corrugated water tank with its pipe, and a trough."""
+    """Build a corrugated water tank with a pipe, and a trough."""
     water = palette.add(Material(texture="water", tint=(0.3, 0.38, 0.36), roughness=0.1, relief=0.1))
     radius, height = rng.uniform(0.55, 0.8), rng.uniform(0.5, 0.75)
     z = np.linspace(0, height, 25)

@@ -1,4 +1,4 @@
-"""Wind turbine heads: twisted blades, hub with spinner, nacelle."""
+"""Wind turbine heads with twisted blades, a hub with a spinner, and a nacelle."""
 
 from dataclasses import dataclass, replace
 
@@ -10,17 +10,17 @@ from stereoweave.synth.props.primitives import boxes, copies, lathe, loft, rotat
 from stereoweave.synth.world import Material, Mesh, join_meshes
 
 STATIONS = 22  # cross-sections along a blade
-OVERHANG_M = 0.34  # from the tower's axis to the rotor's plane
+OVERHANG_M = 0.34  # distance from the tower axis to the rotor plane
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rotor:
-    """Dimensions of a rotor around x; upwind is +x.
+    """Dimensions of a rotor around the x axis, with upwind at +x.
 
     Attributes:
         radius_m: distance from the axis to the tips.
         chord_m: greatest width of a blade.
-        pitch_deg: angle between blades and rotor plane; 90 is feathered.
+        pitch_deg: angle between the blades and the rotor plane; 90 means feathered.
         angle_deg: angle of the first blade from vertical.
         tilt_deg: upward tilt of the axis.
     """
@@ -47,7 +47,7 @@ class TurbineMaterials:
 
 
 def composite_skin(rng: np.random.Generator) -> Material:
-    """Draw the white or light grey skin of blades and towers, slightly dirty."""
+    """Draw a random white or light grey material for blades and towers."""
     grey = rng.uniform(0.68, 0.85)
     return Material(
         texture="plain",
@@ -60,9 +60,9 @@ def composite_skin(rng: np.random.Generator) -> Material:
 
 
 def turbine_head(rotor: Rotor, materials: TurbineMaterials, around: int = 18) -> Mesh:
-    """Build nacelle, hub and blades above the top of the tower, which is at the origin.
+    """Build the nacelle, hub and blades above the top of the tower, which is at the origin.
 
-    around: points per blade section.
+    around: number of points per blade section.
     """
     blades = copies(_blade(rotor, materials, around), _turns(rotor.angle_deg, 3))
     turning = join_meshes([blades, _hub(rotor, materials)]).translate(OVERHANG_M)
@@ -107,7 +107,7 @@ def _blade(rotor: Rotor, materials: TurbineMaterials, around: int) -> Mesh:
 
 
 def _hub(rotor: Rotor, materials: TurbineMaterials) -> Mesh:
-    """Build a spinner that points upwind, and collars around the roots of the blades."""
+    """Build a spinner that points upwind, and collars around the blade roots."""
     size = max(0.06 * rotor.radius_m, 0.12)
     profile = np.array(
         [(0, -1.0), (0.95, -1.0), (1.0, -0.5), (1.0, 0.3), (0.86, 0.85), (0.55, 1.25), (0.2, 1.42), (0, 1.45)]
@@ -126,7 +126,7 @@ def _hub(rotor: Rotor, materials: TurbineMaterials) -> Mesh:
 
 
 def _nacelle(materials: TurbineMaterials) -> Mesh:
-    """Build a rounded nacelle with cooler, railing, wind vanes, lightning rod and lamps."""
+    """Build a rounded nacelle with a cooler, a railing, wind vanes, a lightning rod and lamps."""
     x = np.array([0.24, 0.21, 0.1, -0.25, -0.5, -0.62, -0.65])
     half = np.array([0.1, 0.135, 0.15, 0.155, 0.145, 0.12, 0.08])
     angle = np.arange(24) * 2 * np.pi / 24

@@ -1,1 +1,1 @@
-"""Procedural textures, each drawn from a random generator."""
+"""Random textures, drawn procedurally or cut from photographs."""

@@ -1,6 +1,6 @@
 """Bank of all tileable textures, with colour and height.
 
-Some are cut from scikit-image's photographs; docs/training-data.md lists their licences.
+Some textures are cut from scikit-image's photographs, whose licences are listed in docs/training-data.md.
 """
 
 import functools
@@ -117,7 +117,7 @@ FAMILIES = {
 
 @dataclass(frozen=True)
 class TextureBank:
-    """All textures.
+    """Bank of all textures.
 
     Attributes:
         pixels: uint8 [L, 512, 512, 4], sRGB colour and height; a height of 128 is level with the surface.
@@ -126,7 +126,7 @@ class TextureBank:
     pixels: Pixels
 
     def layer(self, family: str, variant: int) -> int:
-        """Return the index of a texture in `pixels`; `variant` is taken modulo the family's size."""
+        """Return the index of a texture in `pixels`; `variant` is taken modulo the number of variants."""
         if family not in FAMILIES:
             raise StereoweaveError(f"texture: expected one of {', '.join(FAMILIES)}, found {family!r}")
         counts = {name: len(each.variants) for name, each in FAMILIES.items()}
@@ -136,9 +136,9 @@ class TextureBank:
 
 @functools.cache
 def texture_bank() -> TextureBank:
-    """Return the bank, which is identical in every process.
+    """Return the texture bank, which is identical in every process.
 
-    It is drawn once per machine and cached in the user's cache folder.
+    The bank is drawn once per machine and then read from the user's cache folder.
     """
     file = cache_folder().with_name("textures") / f"{_source_version()}.rgba"
     pixels = _read_cache(file)
@@ -172,7 +172,7 @@ def srgb_to_linear(levels: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]
 def _scale_to_albedo(colours: Colours, albedo: float) -> Colours:
     """Scale sRGB colours until their mean in linear light equals the albedo."""
     few, gain = colours[::4, ::4], 1.0
-    # Linear light is about the 2.2nd power of the levels, but levels are clipped, hence the iterations.
+    # Linear light is about the 2.2nd power of the levels. Clipping changes the mean, hence the iterations.
     for _ in range(6):
         gain *= float(albedo / srgb_to_linear(np.clip(few * gain, 0, 255)).mean()) ** (1 / 2.2)
     return colours * gain
@@ -206,12 +206,13 @@ def _write_cache(file: Path, pixels: Pixels) -> None:
                 stream.write(pixels.data)
                 stream.write(_checksum(pixels))
             whole.replace(file)
-        # Other versions are kept for a while: two in alternating use would delete each other's cache.
+        # Caches of other versions are kept for a while, because versions in alternating use would delete each
+        # other's cache.
         for other in file.parent.glob(f"*{file.suffix}"):
             if time.time() - other.stat().st_mtime > _KEPT_DAYS * 86_400:
                 other.unlink()
     except OSError:
-        # The cache is optional: without it, each process draws the bank itself.
+        # The cache is optional. Without it, each process draws the bank itself.
         return
 
 

@@ -8,7 +8,7 @@ from jaxtyping import Bool
 from stereoweave.synth.textures.tiling import SIDE, Colour, Map, Texture, noise, stack_texture, texel_grid
 
 _Choice = Bool[np.ndarray, "side side"]
-_Rule = Callable[[Map, Map], _Choice]  # whether the warp is on top, by row and column of threads
+_Rule = Callable[[Map, Map], _Choice]  # whether the warp is on top, given the row and column of the threads
 
 
 def woven_cloth(rng: np.random.Generator) -> Texture:
@@ -47,7 +47,7 @@ def knitted_cloth(rng: np.random.Generator) -> Texture:
 
 
 def tartan(rng: np.random.Generator) -> Texture:
-    """Draw a tartan with bands of several colours in both directions, woven as twill."""
+    """Draw tartan with bands of several colours in both directions, woven as twill."""
     bands = [np.array(_draw_cloth_colour(rng), np.float32) for _ in range(4)]
     widths = rng.integers(2, 14, 10)
     order = np.repeat(rng.integers(0, 4, 10), widths)

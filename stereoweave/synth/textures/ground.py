@@ -61,7 +61,7 @@ _PEBBLES = (
 
 
 def gravel(rng: np.random.Generator) -> Texture:
-    """Draw gravel of overlapping pebbles in several sizes."""
+    """Draw gravel of overlapping pebbles of several sizes."""
     canvas = np.full((SIDE, SIDE, 4), (58, 54, 48, 20), np.uint8)
     palette = _PEBBLES[rng.integers(len(_PEBBLES))]
     size = rng.uniform(5, 12)
@@ -92,7 +92,7 @@ def asphalt(rng: np.random.Generator) -> Texture:
 def _paint_stones(
     rng: np.random.Generator, canvas: Canvas, count: int, size: float, palette: tuple[Colour, ...]
 ) -> None:
-    """Paint rounded stones, each darker and lower around its rim."""
+    """Paint rounded stones, each darker and lower at its rim."""
     angle = np.arange(9) * 2 * np.pi / 9
     radius = size * np.exp(rng.normal(0, 0.28, count))[:, None] * np.exp(rng.normal(0, 0.1, (count, 9)))
     flat, turn = rng.uniform(0.6, 1, count)[:, None], rng.uniform(0, np.pi, count)[:, None]

@@ -49,7 +49,7 @@ def notice_board(rng: np.random.Generator) -> Texture:
 
 
 def stencilled_numbers(rng: np.random.Generator) -> Texture:
-    """Draw large stencilled letters and numbers on a plain ground, as on containers and hulls."""
+    """Draw large stencilled letters and numbers on a plain background, as on containers and hulls."""
     ground, ink = _SIGN_COLOURS[rng.integers(len(_SIGN_COLOURS))]
     page = Image.new("RGB", (SIDE, SIDE), _integer_colour(ground))
     pen = ImageDraw.Draw(page)
@@ -64,7 +64,7 @@ def stencilled_numbers(rng: np.random.Generator) -> Texture:
 
 
 def posters(rng: np.random.Generator) -> Texture:
-    """Draw four posters side by side, each with a headline above small print."""
+    """Draw a grid of four posters, each with a headline above small print."""
     page = Image.new("RGB", (SIDE, SIDE), (150, 140, 124))
     pen = ImageDraw.Draw(page)
     for left in (0, SIDE // 2):

@@ -21,7 +21,7 @@ from stereoweave.synth.textures.wear import dirt_map
 
 
 def rust(rng: np.random.Generator) -> Texture:
-    """Draw rusty steel with brown and orange patches, dark pits and streaks from rain."""
+    """Draw rusty steel with brown and orange patches, dark pits and rain streaks."""
     broad, fine = noise(rng, 1.3, 3), noise(rng, 0.8, 8)
     tone = 0.5 + 0.17 * broad + 0.12 * fine
     colours = ramp(tone, (56, 43, 38), (86, 59, 47), (116, 76, 54), (142, 100, 72), (132, 108, 88))
@@ -34,7 +34,7 @@ def rust(rng: np.random.Generator) -> Texture:
 
 
 def paint(rng: np.random.Generator) -> Texture:
-    """Draw old, nearly white paint with dirt and with chips whose rims and streaks are rusty."""
+    """Draw old, nearly white, dirty paint with chips that have rusty rims and streaks."""
     broad, edge = noise(rng, 1.5, 3), noise(rng, 1.0, 14)
     damage = noise(rng, 1.6, 5) + 0.45 * edge
     limit = rng.uniform(2.2, 3.1)
@@ -58,7 +58,7 @@ def brushed_steel(rng: np.random.Generator) -> Texture:
 
 
 def spangled_steel(rng: np.random.Generator) -> Texture:
-    """Draw galvanised steel with zinc crystals, each in its own shade of grey."""
+    """Draw galvanised steel with zinc crystals in different shades of grey."""
     large = voronoi_cells(rng, 22, 22, 0.5, rough=2)
     small = voronoi_cells(rng, 64, 64, 0.5)
     feathers = noise(rng, 0.8, 20, stretch=(1, 3))
@@ -74,7 +74,7 @@ def spangled_steel(rng: np.random.Generator) -> Texture:
 
 
 def scratched_steel(rng: np.random.Generator) -> Texture:
-    """Draw worn bare steel with smears and with scratches of all lengths."""
+    """Draw worn, bare steel with smears and with scratches of all lengths."""
     canvas = np.full((SIDE, SIDE, 4), 128, np.uint8)
     count = 900
     turn, length = rng.normal(0.3, 0.7, count), np.exp(rng.normal(3.2, 0.8, count))

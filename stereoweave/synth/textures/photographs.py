@@ -13,7 +13,7 @@ _OVERLAP = SIDE // 4
 
 
 def photograph_crop(name: str, rng: np.random.Generator) -> Texture:
-    """Draw a random crop of one of scikit-image's photographs; brighter texels are slightly higher."""
+    """Return a random crop of one of scikit-image's photographs; brighter texels are slightly higher."""
     part = _mute(rng, _draw_crop(rng, _load_photograph(name)))
     rows = _blend_ends(part)
     colours = _blend_ends(rows.transpose(1, 0, 2)).transpose(1, 0, 2)
@@ -51,7 +51,7 @@ def _mute(rng: np.random.Generator, part: Float[np.ndarray, "_ _ 3"]) -> Float[n
 def _blend_ends(part: Float[np.ndarray, "_ _ 3"]) -> Float[np.ndarray, "_ _ 3"]:
     """Return the first SIDE rows, made tileable.
 
-    The rows that follow them are blended into the first ones.
+    The remaining rows are blended into the first rows.
     """
     share = np.linspace(0, 1, _OVERLAP, dtype=np.float32)[:, None, None]
     share = share * share * (3 - 2 * share)

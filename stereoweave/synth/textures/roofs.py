@@ -18,7 +18,7 @@ from stereoweave.synth.textures.wear import dirt_map
 
 
 def pantiles(rng: np.random.Generator) -> Texture:
-    """Draw overlapping rows of pantiles, wavy across the roof."""
+    """Draw overlapping rows of wavy pantiles."""
     y, x = texel_grid()
     wave = 0.5 + 0.5 * np.sin(2 * np.pi * x / (SIDE / 12) + 0.1 * noise(rng, 1.2, 4))
     row_high = SIDE / 10
@@ -45,7 +45,7 @@ def slates(rng: np.random.Generator) -> Texture:
 
 
 def _fired_clay(rng: np.random.Generator, number: np.ndarray, count: int) -> Colours:
-    """Return the colours of fired clay, one shade per tile, with lichen and soot."""
+    """Return the colours of fired-clay tiles in different shades, with lichen and soot."""
     palette = np.array([(124, 72, 54), (142, 86, 64), (108, 66, 54), (156, 104, 78), (118, 88, 72)])
     shades = palette[rng.integers(0, 5, count)] * np.exp(rng.normal(0, 0.08, (count, 1)))
     colours = shades.astype(np.float32)[number] * (1 + 0.07 * noise(rng, 0.9, 6))[..., None]

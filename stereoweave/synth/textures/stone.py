@@ -59,7 +59,7 @@ def _lay_courses(rng: np.random.Generator) -> tuple[np.ndarray, Map, int]:
 
 
 def _masonry(rng: np.random.Generator, label: np.ndarray, count: int, edge: Map, mortar: Map) -> Texture:
-    """Draw stones in mortar, each in its own shade and rounded towards its rim."""
+    """Draw stones in mortar, in different shades and rounded towards their edges."""
     palette = np.array(_ROCKS[rng.integers(len(_ROCKS))])
     shades = palette[rng.integers(0, 4, count)] * np.exp(rng.normal(0, 0.08, (count, 1)))
     grain, veins = noise(rng, 0.8, 8), noise(rng, 1.4, 8)

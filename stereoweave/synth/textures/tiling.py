@@ -1,4 +1,4 @@
-"""Building blocks of tileable textures: noise, Voronoi cells, and drawing with wraparound.
+"""Building blocks for tileable textures: noise, Voronoi cells, and drawing with wraparound.
 
 All maps are periodic and have SIDE x SIDE texels. Colours are sRGB levels in 0..255. Heights are levels in
 0..255, centred on 128.
@@ -48,16 +48,16 @@ def noise(
     Its amplitude is proportional to frequency**-exponent; photographs have an exponent of about 1.
 
     Args:
-        rng: Source of the noise.
+        rng: Random number generator.
         exponent: Smoothness of the noise.
-        cycles: The spectrum is flat below this many periods per side, so that no large blot gives the tiling
-            away.
+        cycles: Number of periods per side below which the spectrum is flat, so no large blot reveals the
+            tiling.
         stretch: Elongation of structures along y and along x.
     """
     along_y, along_x = stretch[0] * np.fft.fftfreq(SIDE), stretch[1] * np.fft.rfftfreq(SIDE)
     squared = np.add.outer((along_y**2).astype(np.float32), (along_x**2).astype(np.float32))
     strength = np.maximum(squared, (cycles / SIDE) ** 2) ** (-exponent / 2)
-    # A sum of many waves is nearly normal for any amplitudes, so draw uniform ones, which is fastest.
+    # A sum of many waves is nearly normal for any distribution of amplitudes; uniform amplitudes are fastest.
     waves = rng.random((SIDE, SIDE // 2 + 1, 2), np.float32).view(np.complex64)[..., 0] - (0.5 + 0.5j)
     spectrum = waves.astype(np.complex64) * strength
     spectrum[0, 0] = 0
@@ -76,7 +76,7 @@ def voronoi_cells(
 ) -> Cells:
     """Return the Voronoi cells of a jittered grid of rows x columns sites.
 
-    The cells' borders wander by about `rough` texels.
+    The borders of the cells wander by about `rough` texels.
     """
     home = np.indices((rows, columns)).reshape(2, -1).T + 0.5
     sites = home + jitter * rng.uniform(-1, 1, home.shape)
@@ -113,14 +113,14 @@ def warp(image: np.ndarray, down: Map, right: Map, interpolation: int = cv2.INTE
 
 
 def blur(image: np.ndarray, sigma: float) -> np.ndarray:
-    """Blur an image with a Gaussian of `sigma` texels and wraparound."""
+    """Blur an image with wraparound; `sigma` is the standard deviation of the Gaussian in texels."""
     margin = int(4 * sigma) + 1
     padded = cv2.copyMakeBorder(image, margin, margin, margin, margin, cv2.BORDER_WRAP)
     return cv2.GaussianBlur(padded, (0, 0), sigma)[margin:-margin, margin:-margin]
 
 
 def smear_down(source: Map, length: float) -> Map:
-    """Smear a map downwards, fading over `length` texels, as rust and dirt run down a wall."""
+    """Smear a map downwards, fading over `length` texels, like rust and dirt that run down a wall."""
     tail = np.exp(-np.arange(SIDE, dtype=np.float32) / length)
     spectrum = np.fft.rfft(source, axis=0) * np.fft.rfft(tail / tail.sum())[:, None]
     return np.fft.irfft(spectrum, SIDE, axis=0).astype(np.float32)
@@ -131,7 +131,10 @@ def paint_polygons(
     polygons: Float[np.ndarray, "n k 2"],
     levels: Float[np.ndarray, "n 4"],
 ) -> None:
-    """Paint polygons (x, y in texels) in order into colour and height, with wraparound."""
+    """Paint polygons (x and y in texels) onto a canvas in the given order, with wraparound.
+
+    levels: colour and height of each polygon.
+    """
     low, high = polygons.min(1), polygons.max(1)
     shifts = SIDE * (np.indices((3, 3)).reshape(2, 9).T - 1)
     seen = ((high[:, None] + shifts > -1) & (low[:, None] + shifts < SIDE)).all(-1)
@@ -153,7 +156,7 @@ def blade_outlines(
 ) -> Float[np.ndarray, "n 8 2"]:
     """Return the outlines of tapering blades of grass or straw.
 
-    turns: direction at the root and at the tip, in radians.
+    turns: directions at the root and at the tip, in radians.
     """
     share = np.linspace(0, 1, 4)
     way = turns[:, :1] + share * (turns[:, 1:] - turns[:, :1])
@@ -169,7 +172,7 @@ def distance_to_lines(position: np.ndarray, first: float, period: float) -> Map:
 
 
 def smoothstep(low: float, high: float, values: Map) -> Map:
-    """Return a smooth step from 0 at `low` to 1 at `high`; it falls instead of rising if low > high."""
+    """Return a smooth step from 0 at `low` to 1 at `high`; the step falls if low > high."""
     share = np.clip((values - low) / (high - low), 0, 1)
     return share * share * (3 - 2 * share)
 
@@ -177,7 +180,7 @@ def smoothstep(low: float, high: float, values: Map) -> Map:
 def mix(first: np.ndarray | Colour, second: np.ndarray | Colour, share: Map) -> Colours:
     """Blend two images or colours linearly.
 
-    The result is (1 - share) of the first plus share of the second.
+    The result is (1 - share) * first + share * second.
     """
     first, second = np.asarray(first, np.float32), np.asarray(second, np.float32)
     return first + share[..., None] * (second - first)
@@ -191,7 +194,7 @@ def ramp(values: Map, *colours: Colour) -> Colours:
 
 
 def tint_grey(levels: Map, red: float, blue: float) -> Colours:
-    """Convert grey levels to RGB, scaling red and blue by one factor each."""
+    """Convert grey levels to RGB, scaling red and blue by the given factors."""
     return np.dstack([levels * red, levels, levels * blue]).astype(np.float32)
 
 

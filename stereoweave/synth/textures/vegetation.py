@@ -92,7 +92,7 @@ _FOLIAGE: tuple[tuple[Colour, ...], ...] = (
 
 
 def foliage(rng: np.random.Generator) -> Texture:
-    """Draw foliage as seen from a few metres, with overlapping leaves and dark gaps."""
+    """Draw foliage as seen from a few metres away, with overlapping leaves and dark gaps."""
     palette = np.array(_FOLIAGE[rng.integers(len(_FOLIAGE))])
     size, slim = rng.uniform(9, 17), rng.uniform(0.28, 0.5)
     canvas = np.full((SIDE, SIDE, 4), (20, 24, 16, 10), np.uint8)
@@ -115,7 +115,7 @@ def foliage(rng: np.random.Generator) -> Texture:
 
 
 def grass(rng: np.random.Generator) -> Texture:
-    """Draw grass seen from above, with blades in all directions, some of them dry, and soil between them."""
+    """Draw grass seen from above: fresh and dry blades in all directions, with soil between them."""
     fresh = np.array(((64, 78, 40), (78, 92, 50), (94, 106, 60), (86, 94, 62)))
     dry = np.array(((136, 126, 92), (122, 112, 84)))
     dryness, count = rng.uniform(0.02, 0.25), 8500
@@ -149,7 +149,7 @@ def _knots(rng: np.random.Generator, boards: int) -> Map:
 
 
 def _shift_boards(values: Map, shift: np.ndarray, board: np.ndarray) -> Map:
-    """Shift each board's values along y by an amount of its own."""
+    """Shift the values of each board along y by a different amount."""
     rows = (np.arange(SIDE)[:, None] + shift[board]) % SIDE
     return np.take_along_axis(values, rows, 0)
 
@@ -160,7 +160,11 @@ def _leaf_halves(
     length: Float[np.ndarray, " n"],
     slim: float,
 ) -> Float[np.ndarray, "n 2 6 2"]:
-    """Return the outlines of both halves of pointed leaves at `at`; `length` is half a leaf's length."""
+    """Return the outlines of both halves of pointed leaves.
+
+    at: centres of the leaves.
+    length: half the length of each leaf.
+    """
     along = np.linspace(-1, 1, 6)
     bow = slim * (1 - np.abs(along) ** 1.7)
     halves = np.stack([np.stack([along, side * bow], -1) for side in (1, -1)])

@@ -1,4 +1,4 @@
-"""Textures of walls and floors: concrete, plaster, brick, and a nearly plain surface."""
+"""Textures of walls and floors: concrete, plaster, brick and nearly plain surfaces."""
 
 import numpy as np
 
@@ -58,7 +58,7 @@ def stained_concrete(rng: np.random.Generator) -> Texture:
 
 
 def paving_slabs(rng: np.random.Generator) -> Texture:
-    """Draw square paving slabs, each with its own degree of weathering."""
+    """Draw square paving slabs, weathered to different shades."""
     colours, height = _concrete(rng)
     y, x = texel_grid()
     pitch = SIDE / 4
@@ -105,7 +105,7 @@ _BRICKS = (
 
 
 def brickwork(rng: np.random.Generator) -> Texture:
-    """Draw brickwork in stretcher bond, with recessed mortar and each brick in its own shade."""
+    """Draw brickwork in stretcher bond, with recessed mortar and bricks in different shades."""
     y, x = texel_grid()
     wander = noise(rng, 1.4, 8)
     y, x = y + 0.8 * wander, x + 0.8 * noise(rng, 1.4, 8)

@@ -6,7 +6,7 @@ from stereoweave.synth.textures.tiling import Map, Texture, mix, noise, ramp, sm
 
 
 def water(rng: np.random.Generator) -> Texture:
-    """Draw ripples in a main direction, with rounded troughs and sharp crests."""
+    """Draw ripples that mostly run in one direction, with rounded troughs and sharp crests."""
     turn = 5 * noise(rng, 2.0, 4), 5 * noise(rng, 2.0, 4)
     length = rng.uniform(1.5, 3)
     waves = [warp(noise(rng, 2.0, cycles, stretch=(1, length)), *turn) for cycles in (7, 16, 36)]
