@@ -115,7 +115,7 @@ def test_a_repaired_png_and_a_repaired_shard_pass_their_checks(tmp_path, without
     other = shard.replace(b'"focal_px": 60.0', b'"focal_px": 70.0')
     path = tmp_path / name
     path.write_bytes(other)
-    with pytest.raises(StereoweaveError, match="camera.json as written"):
+    with pytest.raises(StereoweaveError, match="camera.json to be intact"):
         shards.read(path)
     path.write_bytes(repair_shard(other))
     shards.read(path)

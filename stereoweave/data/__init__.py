@@ -1,1 +1,1 @@
-"""Reading and writing of datasets: stereo pairs with ground truth."""
+"""Reading and writing of datasets of stereo pairs with ground truth."""

@@ -19,4 +19,4 @@ def verify_checksums(files: Mapping[str, bytes], sums: bytes, where: object, rem
     wrong = [line for line in expected if line not in found]
     if wrong or len(found) != len(expected):
         name = wrong[0].partition(b"  ")[2].decode(errors="replace") if wrong else "a pair"
-        raise FormatError(f"{where}: expected {name} as written, found it damaged or missing; {remedy}")
+        raise FormatError(f"{where}: expected {name} to be intact, found it damaged or missing; {remedy}")

@@ -14,7 +14,7 @@ from stereoweave.stereo import Sample
 
 
 def list_eth3d(root: Path) -> list[Frame]:
-    """List the scenes of two_view_training, whose ground truth is in two_view_training_gt."""
+    """List the scenes in two_view_training; their ground truth is in two_view_training_gt."""
     truth = require_folder(root / "two_view_training_gt")
     return [
         Frame(name=scene.name, read=partial(_read, scene, truth / scene.name))

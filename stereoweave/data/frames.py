@@ -12,10 +12,10 @@ _SUFFIXES = {".png", ".webp", ".jpg", ".pfm"}
 
 @dataclass(frozen=True, kw_only=True)
 class Frame:
-    """A pair of a dataset, read on request.
+    """A stereo pair in a dataset, read on request.
 
     Attributes:
-        name: Unique and stable name, SEQUENCE/FRAME; the sequence may itself contain "/", or be absent.
+        name: Unique and stable name, SEQUENCE/FRAME; the sequence may contain "/" or be absent.
         read: Function that reads the sample; it raises a FormatError if a file is missing or damaged.
     """
 
@@ -29,9 +29,10 @@ class Frame:
 
 
 def match_files(*folders: Path, ending: str = "") -> dict[str, list[Path]]:
-    """Match the files of several folders by name: return one file from each folder per name, sorted by name.
+    """Match the files in several folders by name; return one file per folder for each name, sorted by name.
 
-    A name is the path below the folder without the suffix. Names without this `ending` are ignored.
+    A name is the path relative to the folder, without the file extension. Names that do not end in `ending`
+    are ignored.
 
     Raises:
         StereoweaveError: A folder does not exist.
@@ -44,8 +45,8 @@ def match_files(*folders: Path, ending: str = "") -> dict[str, list[Path]]:
         if missing:
             suffix = next((path.suffix for path in files.values()), "")
             raise FormatError(
-                f"{folder / missing[0]}{suffix}: expected a file, as in the folders beside it, found none; "
-                f"{len(missing)} of {len(names)} files are missing in this folder"
+                f"{folder / missing[0]}{suffix}: expected a file, as in the other folders, found none; "
+                f"{len(missing)} of {len(names)} files are missing from this folder"
             )
     return {name: [files[name] for files in listings] for name in names}
 
@@ -54,7 +55,7 @@ def require_folder(folder: Path) -> Path:
     """Return the folder; raise a StereoweaveError if it does not exist."""
     if not folder.is_dir():
         found = "a file" if folder.exists() else "no such folder"
-        raise StereoweaveError(f"{folder}: expected a folder of the dataset, found {found}")
+        raise StereoweaveError(f"{folder}: expected a dataset folder, found {found}")
     return folder
 
 

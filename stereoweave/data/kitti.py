@@ -18,10 +18,10 @@ from stereoweave.stereo import Sample, StereoCamera, StereoPair
 
 
 def list_kitti2012(root: Path) -> list[Frame]:
-    """List the 194 grey pairs of 2012, such as 000000_10.
+    """List the 194 grey pairs of KITTI 2012, such as 000000_10.
 
     The ground truth is for the grey cameras, 0 and 1. According to the calibration, the colour cameras, 2 and
-    3, are 6 cm beside them.
+    3, are mounted 6 cm to the side of the grey cameras.
     """
     training = root / "training"
     folders = [training / name for name in ("image_0", "image_1", "disp_occ", "disp_noc")]
@@ -29,10 +29,10 @@ def list_kitti2012(root: Path) -> list[Frame]:
 
 
 def list_kitti2015(root: Path) -> list[Frame]:
-    """List the 200 colour pairs of 2015, such as 000000_10; calib_cam_to_cam comes in a separate archive.
+    """List the 200 colour pairs of KITTI 2015, such as 000000_10.
 
-    disp_occ_1 is not read, because it is the left view's disparity at the next time step, not the right
-    view's disparity.
+    The folder calib_cam_to_cam comes in a separate archive. The folder disp_occ_1 is not read, because it
+    contains the left view's disparity at the next time step, not the right view's disparity.
     """
     training = root / "training"
     folders = [training / name for name in ("image_2", "image_3", "disp_occ_0", "disp_noc_0")]
@@ -62,7 +62,7 @@ def _read_disparity(path: Path, pair: StereoPair) -> Float32[np.ndarray, "h w"]:
 def _read_camera(path: Path, keys: tuple[str, str]) -> StereoCamera:
     """Read the camera from the projection matrices P = K [I | t] of both cameras.
 
-    The baseline is the left camera's t minus the right one's, where t is P[0, 3] / focal_px.
+    The baseline is the left camera's t_x minus the right camera's t_x, where t_x is P[0, 3] / focal_px.
     """
     with reading(path, "a KITTI calibration"):
         lines = (
@@ -72,7 +72,8 @@ def _read_camera(path: Path, keys: tuple[str, str]) -> StereoCamera:
         missing = [key for key in keys if len(entries.get(key, [])) != 12]
         if missing:
             raise FormatError(
-                f"{path}: expected a KITTI calibration, found no {' and no '.join(missing)} with 12 numbers"
+                f"{path}: expected a KITTI calibration with 12 numbers each for {' and '.join(keys)}, "
+                f"found no such entry for {' or '.join(missing)}"
             )
         left, right = (np.array(entries[key], float).reshape(3, 4) for key in keys)
         return StereoCamera(

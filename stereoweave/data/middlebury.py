@@ -1,4 +1,4 @@
-"""Middlebury stereo datasets (Scharstein et al.) of 2001 to 2021, with one folder per scene."""
+"""Middlebury stereo datasets (Scharstein et al.) from 2001 to 2021, with one folder per scene."""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -43,7 +43,7 @@ _WITHOUT_TRUTH_2005 = {"Computer", "Drumsticks", "Dwarves"}
 
 
 def list_middlebury2001(root: Path) -> list[Frame]:
-    """List eight scenes of planes, with views 2 and 6 or similar ones; no camera is published."""
+    """List the eight scenes of 2001, in most cases with views 2 and 6; no camera is published."""
     return [
         Frame(
             name=scene.name, read=partial(_read_2001, scene, _FILES_2001.get(scene.name, _OTHER_FILES_2001))
@@ -53,24 +53,27 @@ def list_middlebury2001(root: Path) -> list[Frame]:
 
 
 def list_middlebury2003(root: Path) -> list[Frame]:
-    """List cones and teddy, views 2 and 6, in full, half or quarter size; no camera is published."""
+    """List cones and teddy, with views 2 and 6 at full, half or quarter size; no camera is published."""
     return [Frame(name=scene.name, read=partial(_read_2003, scene)) for scene in list_scene_folders(root)]
 
 
 def list_middlebury2005(root: Path) -> list[Frame]:
-    """List the scenes of 2005, views 1 and 5, in full, half or third size, such as Art or Art/Illum1/Exp0."""
+    """List the scenes of 2005, such as Art or Art/Illum1/Exp0.
+
+    The pictures of a pair are views 1 and 5, at full, half or third size.
+    """
     return [
         Frame(name=views.relative_to(root).as_posix(), read=partial(_read_2006, scene, views))
         for scene in list_scene_folders(root)
         if scene.name not in _WITHOUT_TRUTH_2005
-        # Archives of two views have one picture per view. Those of seven views have one for each illumination
-        # and exposure.
+        # Two-view archives have one picture per view. Seven-view archives have one picture per view for each
+        # illumination and exposure.
         for views in sorted(scene.glob("Illum*/Exp*")) or [scene]
     ]
 
 
 def list_middlebury2006(root: Path) -> list[Frame]:
-    """List the scenes of 2006, such as Aloe or Aloe/Illum1/Exp0; their folders are organised as in 2005."""
+    """List the scenes of 2006, such as Aloe or Aloe/Illum1/Exp0, organised like those of 2005."""
     return list_middlebury2005(root)
 
 
@@ -80,7 +83,7 @@ def list_middlebury2014(root: Path) -> list[Frame]:
 
 
 def list_middlebury2021(root: Path) -> list[Frame]:
-    """List the scenes of 2021, such as artroom1; their folders are organised as in 2014."""
+    """List the scenes of 2021, such as artroom1, organised like those of 2014."""
     return list_middlebury2014(root)
 
 
@@ -118,7 +121,7 @@ def _read_2014(scene: Path) -> Sample:
 
 
 def _find_picture(scene: Path, name: str) -> Path:
-    """Return the path of a picture in the format in which it was downloaded; .png if no such file exists."""
+    """Return a picture's path, with the extension .ppm or .pgm if such a file exists and .png otherwise."""
     kinds = (scene / f"{name}{suffix}" for suffix in (".ppm", ".pgm"))
     return next((path for path in kinds if path.exists()), scene / f"{name}.png")
 
@@ -134,7 +137,7 @@ def _find_shrinking(path: Path, pair: StereoPair, by_height_px: dict[int, int]) 
     if height_px not in by_height_px:
         heights = ", ".join(map(str, by_height_px))
         raise FormatError(
-            f"{path}: expected a published size, {heights} pixels high, found {height_px}; use the published "
+            f"{path}: expected a published height ({heights} pixels), found {height_px}; use the published "
             "picture, because its size determines the unit of the disparities"
         )
     return by_height_px[height_px]
@@ -143,8 +146,8 @@ def _find_shrinking(path: Path, pair: StereoPair, by_height_px: dict[int, int]) 
 def _read_camera_2006(dmin: Path, pair: StereoPair, shrinking: int) -> StereoCamera:
     """Return the published camera, with a focal length of 3740 px at full size and a baseline of 160 mm.
 
-    dmin.txt states by how much cropping reduced each disparity, always in pixels of the full size. No
-    principal point is published, so it is set to the middle of the picture.
+    dmin.txt gives the amount by which cropping reduced each disparity, always in full-size pixels. No
+    principal point is published, so it is set to the centre of the picture.
     """
     with reading(dmin, "a number of pixels"):
         doffs_px = float(read_small(dmin).decode(errors="replace")) / shrinking

@@ -5,10 +5,11 @@
     occluded.png, right_occluded.png                1 bit
     camera.json                                     the camera in pixels and metres, and steps_per_px
 
-A rendered pair of 640x480 takes 0.4 to 1.2 MB, 0.87 MB on average (17 pairs from all scenes). On one core,
-packing takes 25 to 60 ms and unpacking 22 ms.
+A rendered pair of 640x480 takes 0.4 to 1.2 MB, or 0.87 MB on average (17 pairs from all scenes). On one core,
+packing takes 25 to 60 ms and unpacking takes 22 ms.
 
-KITTI's PNG format is unsuitable, because it uses 0 for unknown: the sky has a known disparity of 0.
+KITTI's PNG format is unsuitable, because 0 means unknown in that format, but the sky has a known disparity of
+0.
 """
 
 import io
@@ -28,7 +29,7 @@ from stereoweave.io.decoding import decode_packed_values
 from stereoweave.stereo import Sample, StereoCamera
 
 _UNKNOWN = 65535
-# The rounding error is at most half a step, 0.0005 px; each further power of two costs 20 kB per map.
+# The rounding error is at most half a step, 0.0005 px; each doubling costs 20 kB per map.
 _MOST_STEPS_PER_PX = 1024
 # Data type and channels of a pixel.
 _Kind = tuple[type[np.generic], tuple[int, ...]]
@@ -36,16 +37,16 @@ _RGB: _Kind = np.uint8, (3,)
 _STEPS: _Kind = np.uint16, ()
 _MASK: _Kind = np.bool_, ()
 
-# Mean of four pictures of 640x480 on one core: 379 kB in 7 ms. Method 1 takes 31 ms for 365 kB, 4 takes 96 ms
-# for 352 kB; PNG 8 to 23 ms for 434 to 466 kB.
+# Mean of four pictures of 640x480 on one core: 379 kB in 7 ms. Method 1 takes 31 ms for 365 kB, method 4
+# takes 96 ms for 352 kB, and PNG takes 8 to 23 ms for 434 to 466 kB.
 _WEBP = {"lossless": True, "method": 0, "quality": 0}
 # Mean of four rendered disparity maps, 512 steps per pixel: 145 kB in 10 ms. Level 6 takes 26 ms for 129 kB,
-# OpenCV's default 6 ms for 246 kB. A float32 TIFF would be exact, but takes 27 ms for 378 kB.
+# and OpenCV's default takes 6 ms for 246 kB. A float32 TIFF would be exact, but takes 27 ms for 378 kB.
 _PNG = (cv2.IMWRITE_PNG_COMPRESSION, 3, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB)
 
 
 def pack(sample: Sample, views: Mapping[float, UInt8[np.ndarray, "h w 3"]]) -> dict[str, bytes]:
-    """Pack a pair into files; return their contents by name.
+    """Pack a pair into files, and return the contents of the files by name.
 
     Args:
         sample: The pair and its ground truth, with disparities of 0 or more; NaN means unknown.
@@ -69,10 +70,10 @@ def pack(sample: Sample, views: Mapping[float, UInt8[np.ndarray, "h w 3"]]) -> d
 
 
 def unpack(files: Mapping[str, bytes]) -> Sample:
-    """Unpack the sample from the files of `pack`.
+    """Unpack a sample from the files that `pack` makes.
 
     Raises:
-        ValueError: A file is missing or was not written by `pack`.
+        ValueError: A file is missing or invalid.
     """
     steps_per_px, camera = _parse_camera(_require_file(files, "camera.json"))
     left = _decode(files, "left.webp", _RGB)
@@ -80,7 +81,9 @@ def unpack(files: Mapping[str, bytes]) -> Sample:
     def require_size(name: str, kind: _Kind) -> Shaped[np.ndarray, "h w *channels"]:
         values = _decode(files, name, kind)
         if values.shape[:2] != left.shape[:2]:
-            raise ValueError(f"{name} of {values.shape[1]}x{values.shape[0]} px")
+            raise ValueError(
+                f"{name}: expected the same size as left.webp, found {values.shape[1]}x{values.shape[0]} px"
+            )
         return values
 
     def disparity_px(name: str) -> Float[np.ndarray, "h w"]:
@@ -99,10 +102,10 @@ def unpack(files: Mapping[str, bytes]) -> Sample:
 
 
 def unpack_views(files: Mapping[str, bytes]) -> dict[float, UInt8[np.ndarray, "h w 3"]]:
-    """Unpack the additional views, by position, from the files of `pack`.
+    """Unpack the additional views, by position, from the files that `pack` makes.
 
     Raises:
-        ValueError: A view was not written by `pack`.
+        ValueError: A view is invalid.
     """
     names = sorted(name for name in files if name.startswith("view_"))
     return {float(name[len("view_") : -len(".webp")]): _decode(files, name, _RGB) for name in names}
@@ -117,18 +120,21 @@ def _parse_camera(content: bytes) -> tuple[int, StereoCamera | None]:
             case {"steps_per_px": int(steps), "camera": dict(camera)} if 0 < steps <= _MOST_STEPS_PER_PX:
                 return steps, StereoCamera(**{name: float(value) for name, value in camera.items()})
     except (ValueError, TypeError, OverflowError, RecursionError) as error:
-        raise ValueError(f"invalid camera.json: {error}") from error
-    raise ValueError("camera.json without steps_per_px or camera")
+        raise ValueError(f"camera.json cannot be parsed: {error}") from error
+    raise ValueError("camera.json: steps_per_px or camera is missing or invalid")
 
 
 def _choose_steps_per_px(disparities_px: Iterable[Float[np.ndarray, "h w"]]) -> int:
-    """Choose the largest power of two whose multiples fit 16 bits; division by it is exact."""
+    """Return the greatest number of steps per pixel for which all disparities fit in 16 bits.
+
+    The number is a power of two, which makes division exact, and at most 1024.
+    """
     known_px = np.concatenate([values[~np.isnan(values)] for values in disparities_px])
     least_px, most_px = known_px.min(initial=0), known_px.max(initial=0)
     if least_px < 0 or most_px >= _UNKNOWN:
         raise StereoweaveError(
-            f"a pair to pack: expected disparities of 0 to {_UNKNOWN - 1} px, NaN where unknown, "
-            f"found {least_px:g} to {most_px:g} px"
+            f"pair to pack: expected disparities from 0 to {_UNKNOWN - 1} px, or NaN where unknown, "
+            f"found disparities from {least_px:g} to {most_px:g} px"
         )
     return min(_MOST_STEPS_PER_PX, 2 ** int(math.log2((_UNKNOWN - 1) / max(most_px, 1))))
 
@@ -148,13 +154,13 @@ def _encode(image: UInt8[np.ndarray, "h w 3"] | Bool[np.ndarray, "h w"], kind: s
 
 def _require_file(files: Mapping[str, bytes], name: str) -> bytes:
     if name not in files:
-        raise ValueError(f"no {name}")
+        raise ValueError(f"{name} is missing")
     return files[name]
 
 
 def _decode(files: Mapping[str, bytes], name: str, kind: _Kind) -> Shaped[np.ndarray, "h w *channels"]:
-    """Decode a picture; require the given data type and channels."""
+    """Decode a picture, and require the given data type and number of channels."""
     values = decode_packed_values(name, _require_file(files, name))
     if (values.dtype.type, values.shape[2:]) != kind:
-        raise ValueError(f"{name} with another data type or number of channels")
+        raise ValueError(f"{name} has an unexpected data type or number of channels")
     return values

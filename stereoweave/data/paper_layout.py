@@ -2,15 +2,15 @@
 
 The folders are left, right and depth.
 
-The paper states that the left view's depth ranges from 0 to 15 m, but not the file format. Two formats can be
-read:
+The paper states the range of the left view's depth, which is 0 to 15 m, but not the file format. Two formats
+can be read:
 
 - 16-bit grey PNG with millimetres; 0 and values beyond 15 m are unknown;
 - 8-bit RGB PNG with depth as a fraction of 15 m, (R + 256 G + 65536 B) / (2^24 - 1), as in the simulator
-  CARLA; 0 is unknown, and so is the maximum, which also represents anything beyond 15 m.
+  CARLA; 0 and the maximum, which also represents anything beyond 15 m, are unknown.
 
-Frames are written in the second format. Their checksums in sums/NAME.sha256, for `sha256sum --check` in the
-root, are written last, so a frame with checksums is complete.
+Frames are written in the second format. The checksums of a frame, in sums/NAME.sha256, are written last, so a
+frame with checksums is complete. Running `sha256sum --check` in the root verifies it.
 """
 
 import os
@@ -36,14 +36,14 @@ _ENDINGS = {"left": "png", "right": "png", "calib": "txt", "depth": "png"}
 
 
 def list_paper(root: Path) -> list[Frame]:
-    """List the frames in the folders left, right and depth, whose files have equal names, such as scene/0001.
+    """List the frames, such as scene/0001, with one file each in the folders left, right and depth.
 
-    The camera is in Middlebury's format: calib.txt beside the folders applies to all frames;
-    calib/scene/0001.txt applies to one.
+    Cameras are in Middlebury's format. If there is a calib.txt beside the folders, it applies to all frames;
+    otherwise, each frame has its own file, such as calib/scene/0001.txt.
     """
     camera = root / "calib.txt"
     if not (camera.exists() or (root / "calib").is_dir()):
-        raise FormatError(f"{camera}: expected the camera in Middlebury's format, found no such file")
+        raise FormatError(f"{camera}: expected a camera in Middlebury's format, found no such file")
     folders = [root / name for name in ("left", "right", "depth")]
 
     def find_camera(name: str) -> Path:
@@ -54,15 +54,17 @@ def list_paper(root: Path) -> list[Frame]:
 
 
 def write_frame(root: Path, name: str, sample: Sample) -> None:
-    """Write a frame and its camera; its checksums, written last, mark it as complete.
+    """Write a frame and its camera, then the checksums, which mark the frame as complete.
 
-    Depth of 15 m or more, beyond the range of the paper's camera, becomes unknown.
+    Depths of 15 m or more, which are beyond the range of the paper's camera, become unknown.
 
     Raises:
         StereoweaveError: The sample has no camera, or the folder is full or not writable.
     """
     if sample.camera is None:
-        raise StereoweaveError(f"{root}: expected a sample whose camera is known, to write depth, found none")
+        raise StereoweaveError(
+            f"{root}: expected a sample with a camera, because depth depends on it, found none"
+        )
     files = _frame_files(root, name)
     write_image(files["left"], sample.left)
     write_image(files["right"], sample.right)
@@ -73,13 +75,13 @@ def write_frame(root: Path, name: str, sample: Sample) -> None:
 
 
 def list_complete_frames(root: Path) -> list[str]:
-    """Return the names of the completely written frames, sorted."""
+    """Return the sorted names of all complete frames."""
     sums = root / "sums"
     return sorted(path.relative_to(sums).with_suffix("").as_posix() for path in sums.rglob("[!.]*.sha256"))
 
 
 def remove_unfinished(root: Path) -> None:
-    """Remove the files of incomplete frames; no other process may be writing to the folder."""
+    """Remove the files of incomplete frames. No other process may be writing to the folder."""
     whole = set(list_complete_frames(root))
     for folder in (root / name for name in _ENDINGS):
         for path in folder.rglob("*.*"):
@@ -110,7 +112,7 @@ def _read(files: list[Path], camera: Path) -> Sample:
 
 
 def _unpack_depth_m(stored: Shaped[np.ndarray, "h w *channels"]) -> Float[np.ndarray, "h w"]:
-    """Return the depth in metres, NaN where unknown, given a picture in either format."""
+    """Return the depth in metres from a picture in either format; NaN where unknown."""
     if stored.ndim == 2:
         return np.where((stored > 0) & (stored <= 1000 * RANGE_M), stored / 1000, np.nan)
     packed = stored @ np.array([1, 256, 65536])
@@ -118,7 +120,10 @@ def _unpack_depth_m(stored: Shaped[np.ndarray, "h w *channels"]) -> Float[np.nda
 
 
 def _pack_depth(depth_m: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Pack depth into RGB, as `_unpack_depth_m` reads it; known depth becomes at least 1, as 0 is unknown."""
+    """Pack depth into RGB in the format that `_unpack_depth_m` reads.
+
+    Known depth is stored as at least 1, because 0 means unknown.
+    """
     known = (depth_m > 0) & (depth_m < RANGE_M)
     number = np.rint(np.where(known, depth_m, 0) / RANGE_M * _PACKED_MAX).clip(1, _PACKED_MAX - 1)
     number = np.where(known, number, 0).astype(np.uint32)
@@ -143,7 +148,7 @@ def _checksum_file(root: Path, name: str) -> Path:
 
 
 def _read_synced(path: Path) -> bytes:
-    """Read a file after syncing it to disk: a crash must not preserve its checksums but lose the file."""
+    """Read a file after syncing it to disk, so that a crash cannot keep its checksums but lose the file."""
     with path.open("rb") as stream:
         os.fsync(stream.fileno())
         return stream.read()

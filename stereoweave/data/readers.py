@@ -42,14 +42,14 @@ def open_dataset(name: str, root: str | Path) -> list[Frame]:
     """List the frames of a dataset, sorted by name, given the folder of its unpacked archives.
 
     Raises:
-        StereoweaveError: The dataset is unknown, a folder is missing, or there is no frame.
-        FormatError: A file is visibly missing from a listing; a frame's `read` reports other missing files.
+        StereoweaveError: The dataset is unknown, a folder is missing, or there are no frames.
+        FormatError: A folder lacks a file that another has; a frame's `read` reports other missing files.
     """
     if name not in DATASETS:
         raise StereoweaveError(f"expected one of {', '.join(DATASETS)}, found {name!r}", setting="dataset")
     frames = DATASETS[name](require_folder(Path(root)))
     if not frames:
-        raise StereoweaveError(f"{root}: expected the unpacked archives of {name}, found no frame")
+        raise StereoweaveError(f"{root}: expected the unpacked archives of {name}, found no frames")
     return sorted(frames, key=lambda frame: frame.name)
 
 
@@ -61,7 +61,7 @@ class Scene:
         name: Name of the folder or frame.
         pair: The pair, with its camera if known.
         truth_px: float32 [H, W], true disparity of the left view; NaN where unknown.
-        occluded: True occlusion of the left view; None if the right view's disparity is unknown.
+        occluded: True occlusion mask of the left view; None if the right view's disparity is unknown.
     """
 
     name: str
@@ -71,24 +71,25 @@ class Scene:
 
 
 def read_scenes(folder: str | Path, dataset: str | None = None) -> Iterator[Scene]:
-    """Return an iterator over the scenes of `folder`; arguments and errors are those of `list_scenes`."""
+    """Return an iterator over the scenes in `folder`, with the arguments and errors of `list_scenes`."""
     return (read() for read in list_scenes(folder, dataset))
 
 
 def list_scenes(folder: str | Path, dataset: str | None = None) -> list[Callable[[], Scene]]:
-    """List the scenes of `folder`, sorted by name, as functions that read them.
+    """Return one function per scene in `folder` that reads the scene, sorted by scene name.
 
-    A scene is a folder with left.png, right.png, disparity.png (16 bit, pixels * 256, 0 = unknown) or
-    disparity.pfm (NaN or infinity = unknown), and optionally Middlebury's calib.txt. If there are no such
-    folders, the scenes are the pairs of all rendered sets (`stereoweave synth make`) in `folder`.
+    A scene is a folder with left.png, right.png, a disparity map and optionally Middlebury's calib.txt. The
+    map is disparity.png (16 bits, pixels * 256; 0 means unknown) or disparity.pfm (NaN and infinity mean
+    unknown). If there are no such folders, the scenes are the pairs of all rendered sets in `folder`, which
+    `stereoweave synth make` writes.
 
     Args:
         folder: Folder of the scenes.
-        dataset: Name in `DATASETS` of a dataset to read instead.
+        dataset: Name in `DATASETS`; if given, `folder` is read as that dataset.
 
     Raises:
-        StereoweaveError: The folder has no scene, or `open_dataset` raises the error.
-        FormatError: Raised when a scene is read, if a file is missing, is damaged or has a different size.
+        StereoweaveError: The folder contains no scenes, or `open_dataset` raises the error.
+        FormatError: Raised when a scene is read, if a file is missing, is damaged or has the wrong size.
     """
     if dataset:
         return [partial(_read_frame, frame) for frame in open_dataset(dataset, folder)]
@@ -119,7 +120,7 @@ def _read_scene(folder: Path) -> Scene:
     truth_px = _read_truth(folder)
     if truth_px.shape != pair.left.shape[:2]:
         raise FormatError(
-            f"{folder}: expected ground truth of the pictures' shape {pair.left.shape[:2]}, "
+            f"{folder}: expected ground truth of the same shape as the pictures, {pair.left.shape[:2]}, "
             f"found {truth_px.shape}"
         )
     return Scene(name=folder.name, pair=pair, truth_px=truth_px)

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Shaped
 from stereoweave.errors import FormatError
 from stereoweave.stereo import Sample, StereoPair
 
-# The tolerance of the project's collages, which allows for rounding and nearly touching surfaces.
+# Allows for rounding and for nearly touching surfaces; the training's collages use the same tolerance.
 _TOLERANCE_PX = 0.5
 
 
@@ -19,7 +19,7 @@ def require_size(
     (height_px, width_px), expected = values.shape[:2], pair.left.shape[:2]
     if (height_px, width_px) != expected:
         raise FormatError(
-            f"{path}: expected {expected[1]}x{expected[0]} pixels, like the pictures of its pair, "
+            f"{path}: expected {expected[1]}x{expected[0]} pixels, the size of the pair's pictures, "
             f"found {width_px}x{height_px}"
         )
     return values
@@ -37,7 +37,7 @@ def make_sample(
         pair: The pair, with its camera if known.
         disparity_px: Disparity of the left view; NaN and infinity mean unknown.
         right_disparity_px: Disparity of the right view; None if it is unknown everywhere.
-        occluded: The dataset's mask for the left view; default: computed from the two disparities.
+        occluded: The dataset's mask for the left view; by default, it is computed from the disparities.
     """
     left_px = _mark_unknown(disparity_px)
     right_px = (
@@ -59,8 +59,8 @@ def find_occluded(
 ) -> Bool[np.ndarray, "h w"]:
     """Return the mask of pixels whose match is outside the other image or behind the surface visible there.
 
-    A pixel is not marked if a disparity needed for this is unknown. The other view is to the right of this
-    one; for a right view, mirror both maps.
+    A pixel is not marked if a disparity needed for the comparison is unknown. The other view must be to
+    the right of this view; for a right view, mirror both maps.
     """
     width_px = disparity_px.shape[1]
     match = np.arange(width_px) - disparity_px
@@ -70,8 +70,9 @@ def find_occluded(
     share = (match - before).astype(np.float32)
     after = before + (share > 0)
     before_px, after_px = (np.take_along_axis(other_px, columns, axis=1) for columns in (before, after))
-    # At a disparity jump, the closer of the two columns beside the match decides. On a slope, that column may
-    # be nearer than the surface itself, but the interpolated value is not. Comparisons with NaN are False.
+    # At a disparity jump, the closer of the two columns beside the match decides. On a slope, the disparity
+    # at that column may exceed the surface's own, so the interpolated disparity must be greater, too.
+    # Comparisons with NaN are False.
     column_px = np.where(share < 0.5, before_px, after_px)
     between_px = (1 - share) * before_px + share * after_px
     return outside | (np.minimum(column_px, between_px) > disparity_px + _TOLERANCE_PX)

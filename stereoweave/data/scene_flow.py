@@ -1,7 +1,7 @@
 """Scene Flow (Mayer et al. 2016): FlyingThings3D, Driving and Monkaa, as unpacked.
 
-The root contains the folder disparity, and frames_cleanpass, frames_finalpass or both. All have the same
-subfolders, of which the innermost are left and right.
+The root contains the folder disparity, and frames_cleanpass, frames_finalpass or both. All these folders
+have the same subfolders, the innermost of which are named left and right.
 """
 
 from collections.abc import Iterator
@@ -21,12 +21,12 @@ from stereoweave.stereo import Sample, StereoCamera, StereoPair
 
 _PASSES = {"clean": "frames_cleanpass", "final": "frames_finalpass"}
 
-# Published for pictures of 960x540: lenses of 35 mm and, in one half of Driving, 15 mm.
+# Focal lengths published for pictures of 960x540, with lenses of 35 mm and, in half of Driving, 15 mm.
 _FOCAL_35MM_PX, _FOCAL_15MM_PX = 1050.0, 450.0
 
 
 def list_flyingthings3d(root: Path) -> list[Frame]:
-    """List the frames of both parts of the full FlyingThings3D, such as clean/TRAIN/A/0000/0006."""
+    """List the frames of the full FlyingThings3D, TRAIN and TEST, such as clean/TRAIN/A/0000/0006."""
     return _list_frames(root, {"TRAIN": _FOCAL_35MM_PX, "TEST": _FOCAL_35MM_PX})
 
 
@@ -45,7 +45,7 @@ def _list_frames(root: Path, focal_px: dict[str, float]) -> list[Frame]:
     passes = {kind: root / folder for kind, folder in _PASSES.items() if (root / folder).is_dir()}
     if not passes:
         raise StereoweaveError(
-            f"{root}: expected a folder {' or '.join(_PASSES.values())} in it, found neither"
+            f"{root}: expected a folder named {' or '.join(_PASSES.values())} in it, found neither"
         )
     return [
         Frame(name=PurePosixPath(kind, part, name).as_posix(), read=partial(_read, files, part_focal_px))
@@ -67,24 +67,25 @@ def _match_files(pictures: Path, truth: Path) -> Iterator[tuple[str, list[Path]]
 
 def _read(files: list[Path], focal_px: float) -> Sample:
     left, right, disparity, right_disparity = files
-    # The baseline is 1 Blender unit, which is taken as 1 m. The principal point is the published one.
+    # The baseline is 1 Blender unit, which is taken as 1 m. The principal point is as published.
     camera = StereoCamera(focal_px=focal_px, baseline_m=1.0, cx_px=479.5, cy_px=269.5)
     pair = replace(read_pair(left, right), camera=camera)
     return make_sample(pair, _read_disparity(disparity, pair), _read_disparity(right_disparity, pair))
 
 
 def _read_disparity(path: Path, pair: StereoPair) -> Float32[np.ndarray, "h w"]:
-    """Read a disparity map and drop its sign, which is negative for left views of the later subset.
+    """Read a disparity map and return its absolute values.
 
-    The sign carries no information, because the cameras are parallel.
+    Left views in the later subset have negative values. The sign carries no information, because the cameras
+    are parallel.
 
     Raises:
-        FormatError: The map has the wrong size or disparities of both signs.
+        FormatError: The map has the wrong size or contains disparities of both signs.
     """
     values_px = require_size(read_pfm(path), path, pair)
     if (values_px < 0).any() and (values_px > 0).any():
         raise FormatError(
-            f"{path}: expected disparities of the same sign, found {np.nanmin(values_px):.3f} to "
-            f"{np.nanmax(values_px):.3f}; is it a map of disparity changes?"
+            f"{path}: expected disparities of the same sign, found values from {np.nanmin(values_px):.3f} to "
+            f"{np.nanmax(values_px):.3f}; is this a map of disparity changes?"
         )
     return np.abs(values_px)

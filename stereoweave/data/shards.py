@@ -1,9 +1,9 @@
-"""Large sets as tar files in webdataset's format, which are read by index or nearly sequentially.
+"""Large sets stored as tar files in webdataset's format and read by index or almost sequentially.
 
-A set is a folder of shards SET-FIRST-LAST.tar, named after their first and last pair, such as
-ship-000050-000099.tar. Its pair 57 consists of the files of packing.py, such as ship-000057.left.webp, and of
-their checksums, ship-000057.sha256. Equal pairs give equal bytes. A shard is written atomically and never
-changed.
+A set is a folder of shards, each named SET-FIRST-LAST.tar after its first and last pair, such as
+ship-000050-000099.tar. In this shard, pair 57 consists of the files that packing.py makes, such as
+ship-000057.left.webp, and of their checksums, ship-000057.sha256. Equal pairs give equal bytes. A shard is
+written atomically and never changed.
 """
 
 import os
@@ -33,12 +33,12 @@ Unpacked = TypeVar("Unpacked")
 _SUMS = "sha256"
 _DELETE = "delete it, and rerun the same `stereoweave synth make` command"
 _NAME = re.compile(r"(.+)-(\d{6,})-(\d{6,})\.tar")
-# Number of shards among which `Shards.order` mixes pairs: 400 pairs if `stereoweave synth make` wrote them.
+# Number of shards among which `Shards.order` mixes pairs; they contain 400 pairs if written by `synth make`.
 _WINDOW = 8
 
 
 class Shard(NamedTuple):
-    """One file of a set, and the numbers of its first and last pair."""
+    """A file in a set, and the numbers of its first and last pair."""
 
     path: Path
     set_name: str
@@ -72,7 +72,7 @@ def list_shards(folder: Path, set_name: str | None = None) -> list[Shard]:
 
     Args:
         folder: Folder of the set.
-        set_name: Name of the set; default: that of the first shard.
+        set_name: Name of the set; by default, the set name of the first shard.
 
     Raises:
         FormatError: A shard belongs to another set, or overlaps the previous one.
@@ -83,24 +83,25 @@ def list_shards(folder: Path, set_name: str | None = None) -> list[Shard]:
     for shard in shards:
         if shard.set_name != (expected := set_name or shards[0].set_name):
             raise FormatError(
-                f"{shard.path}: expected a shard of {expected}, found one of another set; move or delete it"
+                f"{shard.path}: expected a shard of {expected}, found a shard of {shard.set_name}; "
+                "move or delete it"
             )
     for before, shard in pairwise(shards):
         if shard.first <= before.last:
             raise FormatError(
-                f"{shard.path}: expected no pair of {before.path.name}, found some in both shards; {_DELETE}"
+                f"{shard.path}: expected no overlap with {before.path.name}, found pairs in both; {_DELETE}"
             )
     return shards
 
 
 class Shards:
-    """The pairs of a set, by index; an object can be pickled and keeps no file open."""
+    """The pairs of a set, accessed by index. Instances can be pickled and keep no files open."""
 
     def __init__(self, folder: Path, set_name: str | None = None) -> None:
         """List the shards of a folder.
 
         Raises:
-            FormatError: There is no shard, there is a gap between shards, or `list_shards` raises the error.
+            FormatError: There are no shards or a gap between shards, or `list_shards` raises the error.
         """
         self.shards = list_shards(folder, set_name)
         if not self.shards:
@@ -109,8 +110,8 @@ class Shards:
         for shard in self.shards:
             if shard.first != self._starts[-1]:
                 raise FormatError(
-                    f"{folder}: expected pair {self._starts[-1]} in the next shard, found {shard.path.name}; "
-                    "rerun the same `stereoweave synth make` command"
+                    f"{folder}: expected the next shard to start at pair {self._starts[-1]}, "
+                    f"found {shard.path.name}; rerun the same `stereoweave synth make` command"
                 )
             self._starts.append(shard.last + 1)
         self.count = self._starts[-1]
@@ -128,7 +129,7 @@ class Shards:
         return self._unpack_pair(index, unpack_views)
 
     def files(self, index: int) -> dict[str, bytes]:
-        """Return the verified content of a pair's files, by suffix.
+        """Return the verified contents of a pair's files by suffix.
 
         Raises:
             FormatError: A file is damaged or missing.
@@ -142,7 +143,7 @@ class Shards:
         return {end.removeprefix(f"{name}."): content for end, content in files.items()}
 
     def order(self, rng: np.random.Generator) -> Int[np.ndarray, " n"]:
-        """Return all indices in an order that is random but reads only a few shards at a time, each once."""
+        """Return all indices in a random order that mixes the pairs of only a few shards at a time."""
         sizes = np.diff(self._starts)
         window = rng.permutation(len(sizes)) // _WINDOW
         return np.lexsort((rng.random(self.count), window.repeat(sizes)))
@@ -153,17 +154,17 @@ class Shards:
             return unpack(files)
         except (ValueError, KeyError, TypeError) as error:  # valid checksums do not prove who wrote the files
             raise FormatError(
-                f"{self._find_shard(index).path}: expected all files of a pair, found {self.name(index)} "
-                f"with missing or damaged ones ({error}); {_DELETE}"
+                f"{self._find_shard(index).path}: expected all files of a pair to be intact, "
+                f"found missing or damaged files in {self.name(index)} ({error}); {_DELETE}"
             ) from error
 
     def _find_shard(self, index: int) -> Shard:
         if not 0 <= index < self.count:
-            raise IndexError(f"pair {index} of {self.count}")
+            raise IndexError(f"expected a pair index from 0 to {self.count - 1}, found {index}")
         return self.shards[bisect_right(self._starts, index) - 1]
 
     def _locate_files(self, path: Path) -> dict[str, dict[str, tuple[int, int]]]:
-        """Return offset and size of each pair's files in a shard; they are cached because reading is slow."""
+        """Return the offset and the size of each pair's files in a shard, cached because reading is slow."""
         if path not in self._contents:
             self._contents[path] = _list_contents(path)
         return self._contents[path]
@@ -187,9 +188,8 @@ def list_frames(root: Path) -> list[Frame]:
 def _add_pair(tar: tarfile.TarFile, name: str, pair: Mapping[str, bytes]) -> None:
     files = {f"{name}.{end}": content for end, content in sorted(pair.items())}
     for file, content in [*files.items(), (f"{name}.{_SUMS}", make_checksums(files))]:
-        header = tarfile.TarInfo(
-            file
-        )  # no owner and the year 1970, so that the bytes depend on the pair alone
+        # TarInfo's defaults, no owner and the year 1970, let the bytes depend on the pair alone.
+        header = tarfile.TarInfo(file)
         header.size = len(content)
         tar.addfile(header, BytesIO(content))
 
@@ -199,13 +199,13 @@ def _list_contents(path: Path) -> dict[str, dict[str, tuple[int, int]]]:
     try:
         with tarfile.open(path, "r:") as tar:
             for member in tar:
-                if member.size < 0:  # would read the same header forever
-                    raise tarfile.ReadError(f"a size of {member.size} bytes")
+                if member.size < 0:  # otherwise, the same header would be read forever
+                    raise tarfile.ReadError(f"a file has {member.size} bytes")
                 name, _, end = member.name.partition(".")
                 contents[name][end] = member.offset_data, member.size
     except tarfile.TarError as error:
         raise FormatError(
-            f"{path}: expected a shard, which is a tar file, found a damaged one ({error}); {_DELETE}"
+            f"{path}: expected a shard, which is a tar file, found a damaged file ({error}); {_DELETE}"
         ) from error
     return dict(contents)
 

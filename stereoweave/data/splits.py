@@ -1,4 +1,4 @@
-"""Division of a dataset into training and held-out frames, by the rules in split_rules/."""
+"""Division of a dataset into training and held-out frames, according to the rules in split_rules/."""
 
 import tomllib
 from fnmatch import fnmatchcase
@@ -15,7 +15,7 @@ SPLITS = ("random", "disjoint")
 
 
 def split_frames(frames: list[Frame], dataset: str, split: str) -> tuple[list[Frame], list[Frame]]:
-    """Split frames into training and held-out ones, each sorted by name.
+    """Split frames into training frames and held-out frames, each sorted by name.
 
     Args:
         frames: Frames of one dataset, in any order.

@@ -12,10 +12,10 @@ class Stage:
     """A world with the viewpoints from which it is rendered.
 
     Attributes:
-        world: everything that the cameras see.
-        orbit: range of the viewpoints.
-        nearest_px: range of the nearest surface's disparity in an image 640 px wide.
-        noise_levels: standard deviation of sensor noise on white, in grey levels (0..255).
+        world: Everything that the cameras see.
+        orbit: Range of the viewpoints.
+        nearest_px: Range of the nearest surface's disparity in an image 640 px wide.
+        noise_levels: Standard deviation of sensor noise on white, in grey levels (0..255).
     """
 
     world: World
@@ -51,7 +51,7 @@ def outdoor_stage(
     orbit: Orbit,
     nearest_px: tuple[float, float] = NEAREST_PX,
 ) -> Stage:
-    """Build an outdoor stage from a mesh, the palette of its materials, daylight and viewpoints."""
+    """Build an outdoor stage from a mesh, the palette of its materials, daylight and an orbit."""
     world = World(
         mesh=mesh,
         materials=tuple(palette.materials),

@@ -16,10 +16,10 @@ class PosedRig:
     """A rectified rig with its pose in the world.
 
     Attributes:
-        camera: intrinsics and baseline; doffs_px is 0.
-        size_px: width and height of the images.
-        position_m: the left camera's centre [3] in the world.
-        axes: rotation [3, 3]; its rows are the camera's right, down and forward axes in the world.
+        camera: Intrinsics and baseline; doffs_px is 0.
+        size_px: Width and height of the images.
+        position_m: The left camera's centre [3] in the world.
+        axes: Rotation [3, 3]; its rows are the camera's right, down and forward axes in the world.
     """
 
     camera: StereoCamera
@@ -37,12 +37,12 @@ class Orbit:
     """Range of a scene's viewpoints, in spherical coordinates around a point.
 
     Attributes:
-        centre_m: centre of the orbit; the cameras look at a point near it.
-        distance_m: least and greatest distance from the centre.
-        azimuth_deg: least and greatest azimuth around z, measured from x towards y.
-        elevation_deg: least and greatest elevation above the horizon.
-        aim_m: greatest distance from the centre to the point that the cameras look at.
-        floor_m: least z of the point midway between the cameras.
+        centre_m: Centre of the orbit; the cameras look at a point near it.
+        distance_m: Least and greatest distance from the centre.
+        azimuth_deg: Least and greatest azimuth around z, measured from x towards y.
+        elevation_deg: Least and greatest elevation above the horizon.
+        aim_m: Greatest distance from the centre to the point that the cameras look at.
+        floor_m: Least z of the point midway between the cameras.
     """
 
     centre_m: tuple[float, float, float]
@@ -55,7 +55,7 @@ class Orbit:
 
 @dataclass(frozen=True, kw_only=True)
 class Viewpoint:
-    """A viewpoint on an orbit."""
+    """A position on an orbit, with the point to look at and the roll of the cameras."""
 
     distance_m: float
     azimuth_deg: float
@@ -84,7 +84,7 @@ def draw_focal_px(rng: np.random.Generator, width_px: int) -> float:
 def draw_nearest_px(
     rng: np.random.Generator, width_px: int, range_px: tuple[float, float] = NEAREST_PX
 ) -> float:
-    """Draw the nearest surface's disparity, log-uniform in a range given for images 640 px wide.
+    """Draw the nearest surface's disparity log-uniformly from a range given for images 640 px wide.
 
     The baseline is derived from this disparity, because training depends more on the distribution of
     disparities than on the distribution of baselines.
@@ -93,7 +93,10 @@ def draw_nearest_px(
 
 
 def place_rig(orbit: Orbit, viewpoint: Viewpoint, camera: StereoCamera, size_px: tuple[int, int]) -> PosedRig:
-    """Place the rig at a viewpoint, facing its aim; the midpoint between the cameras lies on the orbit."""
+    """Place a rig at a viewpoint, facing the point that the viewpoint aims at.
+
+    The midpoint between the cameras lies at the viewpoint, but no lower than the orbit's `floor_m`.
+    """
     azimuth, elevation = np.radians([viewpoint.azimuth_deg, viewpoint.elevation_deg])
     outwards = np.array(
         [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]

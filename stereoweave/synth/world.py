@@ -29,7 +29,7 @@ class Mesh:
 
     def transform(self, pose: Float[np.ndarray, "4 4"]) -> "Mesh":
         """Return the mesh transformed by an affine pose; its texture coordinates stay unchanged."""
-        # One large product, because NumPy is slow at many small ones.
+        # One large product, because many small products are slow in NumPy.
         corners_m = self.corners_m.reshape(-1, 3) @ pose[:3, :3].T.astype(np.float32)
         normals = self.normals.reshape(-1, 3) @ np.linalg.inv(pose[:3, :3]).astype(np.float32)
         normals /= np.sqrt(np.einsum("ij,ij->i", normals, normals))[:, None]
@@ -49,7 +49,7 @@ class Mesh:
 
 
 def join_meshes(meshes: Iterable[Mesh]) -> Mesh:
-    """Join meshes into one."""
+    """Join several meshes into one."""
     parts = list(meshes)
     names = ("corners_m", "normals", "uv_m", "material", "target")
     return Mesh(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
@@ -60,14 +60,14 @@ class Material:
     """Appearance of a surface.
 
     Attributes:
-        texture: a family of the texture bank (textures.bank.FAMILIES), such as "rust".
-        variant: index of the texture in its family, taken modulo the family's size.
-        tint: factor that multiplies the texture's colour.
-        span_m: period of the texture in metres.
-        roughness: 0 (like a mirror) to 1 (like chalk).
-        metal: 0 for paint, stone and cloth, 1 for bare metal.
-        relief: strength of the bump map, 0 to 1.
-        glow: emitted light, as a multiple of the colour.
+        texture: A family of the texture bank (textures.bank.FAMILIES), such as "rust".
+        variant: Index of the texture in its family, taken modulo the family's size.
+        tint: Factor that multiplies the texture's colour.
+        span_m: Period of the texture in metres.
+        roughness: From 0 (like a mirror) to 1 (like chalk).
+        metal: 0 for paint, stone and cloth; 1 for bare metal.
+        relief: Strength of the bump map, from 0 to 1.
+        glow: Emitted light, as a multiple of the colour.
     """
 
     texture: str
@@ -85,12 +85,12 @@ class Sky:
     """The sky, the sun and their light.
 
     Attributes:
-        sun: unit vector towards the sun.
-        sun_light: the sun's colour and strength; (0, 0, 0) indoors.
-        zenith, horizon, ground: colours of the sky's gradient, which is visible and lights surfaces from
+        sun: Unit vector towards the sun.
+        sun_light: The sun's colour and strength; (0, 0, 0) indoors.
+        zenith, horizon, ground: Colours of the sky's gradient, which is visible and lights surfaces from
             above, from the side and from below.
-        cloud_variant: index of the cloud texture in the family "sky".
-        clouds: cloud cover, 0 (clear) to 1 (overcast).
+        cloud_variant: Index of the cloud texture in the family "sky".
+        clouds: Cloud cover, from 0 (clear) to 1 (overcast).
     """
 
     sun: tuple[float, float, float]
@@ -107,8 +107,8 @@ class Lamp:
     """A point light that casts no shadows; its light falls off with the square of the distance.
 
     Attributes:
-        position_m: position in the world.
-        light: colour and strength at 1 m.
+        position_m: Position in the world.
+        light: Colour and strength at 1 m.
     """
 
     position_m: tuple[float, float, float]
@@ -128,10 +128,10 @@ class World:
     """Everything that a renderer needs except the camera.
 
     Attributes:
-        mesh: all triangles.
-        materials: at most 64; `mesh.material` is an index into them.
-        lamps: at most 4.
-        exposure: factor that multiplies colours before tone mapping.
+        mesh: All triangles.
+        materials: At most 64; `mesh.material` is an index into them.
+        lamps: At most 4.
+        exposure: Factor that multiplies colours before tone mapping.
     """
 
     mesh: Mesh
@@ -148,7 +148,7 @@ class RenderedView:
 
     Attributes:
         image: uint8 RGB [H, W, 3].
-        depth_m: depth along the optical axis at pixel centres, float32 [H, W]; infinite for the sky.
+        depth_m: Depth along the optical axis at pixel centres, float32 [H, W]; infinite for the sky.
         target: bool [H, W], whether the pixel centre shows the scene's subject.
     """
 

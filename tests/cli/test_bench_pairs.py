@@ -86,7 +86,7 @@ def test_every_matcher_has_every_number_and_both_plots_are_written(sets, tmp_pat
         ("--plot time.words", ["time.words: expected a picture file ending", "'.words'"]),
         ("--sparsification words", ["words: expected a picture file ending"]),
         ("--dataset words", ["dataset: expected one of", "'words'"]),
-        ("--dataset kitti2015", ["expected a folder of the dataset"]),
+        ("--dataset kitti2015", ["expected a dataset folder"]),
         ("--cluster 127.0.0.1:1", ["127.0.0.1:1: expected the head of a Ray cluster"]),
     ],
 )

@@ -84,7 +84,7 @@ def test_a_view_of_another_size_is_reported_in_one_line(tmp_path, capfd):
     photographs(tmp_path / "sets" / "shed", "left", "right")
     photographs(tmp_path / "sets" / "shed", "view_0.5", size=(48, 60))
     _refused(
-        tmp_path, capfd, "view_0.5.png: expected 64x48 pixels, like the pictures of its pair, found 60x48"
+        tmp_path, capfd, "view_0.5.png: expected 64x48 pixels, the size of the pair's pictures, found 60x48"
     )
 
 

@@ -67,7 +67,7 @@ ERRORS = {
     "found 'diagonal'",
     "synth make pylon --pairs 1 --size 8x8 -o set": "--size: expected 32 to 4096 px per side, found 8x8",
     "synth make pylon --pairs 1 --view 3 -o set": "--view: expected positions from -1.0 to 2.0 (0 is the "
-    "left camera, 1 the right one), found 3.0",
+    "left camera and 1 the right one), found 3.0",
     "export small": "export: expected an output file, found none; give at least one (--out, --half, "
     "--eight-bits)",
     "bench collages -o set --pairs 2 --size 64x16": "--size: expected at least 32x32 pixels, found 64x16",

@@ -151,7 +151,7 @@ def test_a_cluster_that_does_not_answer_is_reported_in_one_line(tmp_path, capsys
     told = capsys.readouterr()
     assert told.out == ""
     assert "127.0.0.1:1: expected the head of a Ray cluster, found " in told.err
-    assert told.err.endswith("; all finished pairs are complete: rerun the same command to resume\n")
+    assert told.err.endswith("; all finished pairs are complete; rerun the same command to resume\n")
     assert told.err.count("\n") == 1
 
 

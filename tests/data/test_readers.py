@@ -67,7 +67,8 @@ def test_a_scene_without_ground_truth_is_an_error(scene):
 def test_ground_truth_of_another_size_is_an_error(scene):
     maps.write_pfm(scene / "disparity.pfm", np.ones((32, 41)))
     with pytest.raises(
-        FormatError, match=r"expected ground truth of the pictures' shape \(32, 40\).*found \(32, 41\)"
+        FormatError,
+        match=r"of the same shape as the pictures, \(32, 40\).*found \(32, 41\)",
     ):
         list(read_scenes(scene.parent))
 

@@ -100,7 +100,7 @@ def test_pairs_are_read_by_index_across_shards(folder):
     [
         ({"left.webp": b"RIFF"}, "left.webp: expected a picture"),
         ({"disparity.png": b"%!PS-Adobe-3.0 EPSF-3.0\n"}, "disparity.png: expected a picture"),
-        ({"camera.json": b"[]"}, "found ship-000000 with missing or damaged ones"),
+        ({"camera.json": b"[]"}, "found missing or damaged files in ship-000000"),
         ({"camera.json": b"{}"}, "steps_per_px"),
     ],
 )
@@ -160,7 +160,7 @@ def test_a_byte_that_changed_is_noticed_and_the_pair_named(folder):
     content[place] ^= 1
     path.write_bytes(content)
     message = error_of(Shards(folder).files, 6)
-    assert message.startswith(f"{path}: expected ship-000006.right.webp as written, found it damaged")
+    assert message.startswith(f"{path}: expected ship-000006.right.webp to be intact, found it damaged")
     assert_equal(Shards(folder)[5], pair(5))
 
 
@@ -186,14 +186,22 @@ def facts(**changes):
 @pytest.mark.parametrize(
     ("name", "content", "found"),
     [
-        ("right.webp", None, "no right.webp"),
-        ("camera.json", None, "no camera.json"),
+        ("right.webp", None, "right.webp is missing"),
+        ("camera.json", None, "camera.json is missing"),
         ("left.webp", b"no picture", "left.webp"),
         ("left.webp", b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 48 32\n", "left.webp"),
-        ("left.webp", png(np.zeros((32, 48), np.uint8)), "left.webp with another data type"),
-        ("disparity.png", png(np.zeros((32, 48), np.uint8)), "disparity.png with another data type"),
-        ("disparity.png", png(np.zeros((32, 47), np.uint16)), "disparity.png of 47x32"),
-        ("occluded.png", png(np.zeros((31, 48), bool)), "occluded.png of 48x31"),
+        ("left.webp", png(np.zeros((32, 48), np.uint8)), "left.webp has an unexpected data type"),
+        ("disparity.png", png(np.zeros((32, 48), np.uint8)), "disparity.png has an unexpected data type"),
+        (
+            "disparity.png",
+            png(np.zeros((32, 47), np.uint16)),
+            "disparity.png: expected the same size as left.webp, found 47x32",
+        ),
+        (
+            "occluded.png",
+            png(np.zeros((31, 48), bool)),
+            "occluded.png: expected the same size as left.webp, found 48x31",
+        ),
         ("camera.json", b"[" * 5000, "recursion"),
         ("camera.json", b"[]", "camera.json"),
         ("camera.json", facts(steps_per_px=0), "camera.json"),
@@ -245,7 +253,7 @@ def test_a_shard_with_a_file_of_a_negative_size_is_refused(tmp_path):
 def test_a_shard_that_is_missing_between_others_is_noticed(folder):
     (folder / "ship-000004-000007.tar").unlink()
     message = error_of(Shards, folder)
-    assert "expected pair 4" in message
+    assert "expected the next shard to start at pair 4" in message
     assert "found ship-000008-000009.tar" in message
 
 
@@ -254,9 +262,9 @@ def test_a_shard_that_is_missing_between_others_is_noticed(folder):
     [
         (
             "ship-000003-000005.tar",
-            "expected no pair of ship-000000-000003.tar, found some in both shards; delete it",
+            "expected no overlap with ship-000000-000003.tar, found pairs in both; delete it",
         ),
-        ("towns-000004-000007.tar", "expected a shard of ship, found one of another set; move or delete it"),
+        ("towns-000004-000007.tar", "expected a shard of ship, found a shard of towns; move or delete it"),
     ],
 )
 def test_a_shard_too_many_is_named_with_what_to_do(folder, name, words):

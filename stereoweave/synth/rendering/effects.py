@@ -10,12 +10,12 @@ class Effects:
     """Switches for the rendering effects; `synth costs` measures the time that each one takes.
 
     Attributes:
-        shadows: shadows cast by the sun.
-        ambient_occlusion: weaker skylight in corners and narrow places.
-        gloss: highlights from the sun and lamps, and reflections of the sky.
-        fog: haze that grows with distance.
-        relief: bump mapping from the texture's height map.
-        samples: 2 for 2x2 samples per pixel, 1 for a single sample at its centre.
+        shadows: Shadows cast by the sun.
+        ambient_occlusion: Weaker skylight in corners and narrow places.
+        gloss: Highlights from the sun and lamps, and reflections of the sky.
+        fog: Haze that grows with distance.
+        relief: Bump mapping from the texture's height map.
+        samples: 2 for 2x2 samples per pixel, 1 for a single sample at the pixel's centre.
     """
 
     shadows: bool = True

@@ -7,15 +7,15 @@ from jaxtyping import Float, Int
 
 from stereoweave.synth.viewpoints import PosedRig
 
-# Distance of the near plane; the 24-bit depth buffer covers the range from it to infinity.
+# Distance of the near plane; the 24-bit depth buffer covers the range from there to infinity.
 NEAR_M = 0.1
 
 
 def projection(rig: PosedRig) -> Float[np.ndarray, "4 4"]:
     """Return the matrix from camera coordinates (right, down, forward, 1) to OpenGL's clip space.
 
-    Frame buffer rows run downwards like image rows, so reading them needs no flip. The rig's pixel centres
-    are at integers, OpenGL's at half-integers.
+    Frame buffer rows run downwards like image rows, so reading them needs no flip. Pixel centres
+    are at integers in the rig, and at half-integers in OpenGL.
     """
     width_px, height_px = rig.size_px
     camera = rig.camera
@@ -35,7 +35,7 @@ def triangles_in_view(
     """Return the indices of the triangles in view from any of the positions, roughly from near to far.
 
     Near triangles come first, because the depth test then skips the shading of triangles behind them.
-    `corners_m` is a contiguous `Mesh.corners_m.T`: axis, corner, triangle.
+    `corners_m` is a contiguous `Mesh.corners_m.T`, indexed by axis, corner and triangle.
     """
     away_m = corners_m.reshape(3, -1) - rig.position_m.astype(np.float32)[:, None]
     right, down, forward = (rig.axes.astype(np.float32) @ away_m).reshape(corners_m.shape)
@@ -50,22 +50,22 @@ def triangles_in_view(
     )
     seen = np.flatnonzero(~outside)
     # Sort by the farthest corner, so that large ground triangles follow the objects on them. Positive floats
-    # sort like their bits, and sorting 16 bits is fast.
+    # have the same order as their bits, and sorting 16 bits is fast.
     farthest_m = forward.max(0)[seen]
     return seen[np.argsort((farthest_m.view(np.uint32) >> 16).astype(np.uint16), kind="stable")]
 
 
 def _image_edges(rig: PosedRig) -> Float[np.ndarray, "2 2"]:
-    """Return the image's borders at depth 1: left and right, upper and lower."""
+    """Return the coordinates of the image's borders at depth 1, as [[left, right], [upper, lower]]."""
     camera, (width_px, height_px) = rig.camera, rig.size_px
     borders_px = np.array([[-0.5, width_px - 0.5], [-0.5, height_px - 0.5]])
     return (borders_px - [[camera.cx_px], [camera.cy_px]]) / camera.focal_px
 
 
 def direction_matrix(rig: PosedRig, samples: int) -> Float[np.ndarray, "3 3"]:
-    """Return the matrix from OpenGL's (column, row, 1) to world directions whose depth is 1.
+    """Return the matrix from OpenGL's (column, row, 1) to world directions, scaled to depth 1.
 
-    Columns and rows count samples, of which each pixel has `samples` x `samples`.
+    Columns and rows are counted in samples; each pixel has `samples` x `samples` of them.
     """
     camera = rig.camera
     to_camera = np.array(

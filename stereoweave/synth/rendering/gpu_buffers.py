@@ -15,16 +15,16 @@ from stereoweave.synth.world import World
 
 # Relief height of a texture at full strength, as a fraction of its period.
 _RELIEF_SHARE = 0.018
-_FLOATS = 12  # floats of a material in std140 layout: three vectors of four
+_FLOATS = 12  # floats per material in std140 layout, which are three vectors of four
 
 
 class Geometry:
     """A world's triangles in GPU memory; `release` frees the memory.
 
     Attributes:
-        world: the world that the triangles belong to.
-        corners_m: corners of the triangles, float32 [3, 3, N]: axis, corner, triangle.
-        target_m: corners of the target's triangles, or of all triangles if the world has no target.
+        world: The world that the triangles belong to.
+        corners_m: Corners of the triangles, float32 [3, 3, N], indexed by axis, corner and triangle.
+        target_m: Corners of the target's triangles, or of all triangles if the world has no target.
     """
 
     def __init__(self, gl: moderngl.Context, world: World) -> None:
@@ -76,7 +76,7 @@ def _reporting_lack_of_memory(what: str) -> Iterator[None]:
 def _check_limits(world: World) -> None:
     for name, most, remedy in (
         ("materials", MOST_MATERIALS, "share materials between parts"),
-        ("lamps", MOST_LAMPS, "omit the faintest ones"),
+        ("lamps", MOST_LAMPS, "omit the faintest lamps"),
     ):
         count = len(getattr(world, name))
         if count > most:
@@ -112,7 +112,8 @@ def upload_textures(
 ) -> moderngl.TextureArray:
     """Upload all textures with mipmaps; colours are stored as square roots of linear light.
 
-    llvmpipe filters bytes fastest, and one multiplication in the shader restores linear light.
+    Square roots can be stored in bytes, which llvmpipe filters fastest, and the shader restores linear light
+    with one multiplication.
     """
     layers, height, width, channels = pixels.shape
     array = gl.texture_array((width, height, layers), channels)
@@ -127,7 +128,7 @@ def upload_textures(
 
 
 class FrameBuffers:
-    """Frame buffers for one image size: depth, samples and pixels; `release` frees them."""
+    """Frame buffers for the depth, samples and pixels of one image size; `release` frees them."""
 
     def __init__(self, gl: moderngl.Context, size_px: tuple[int, int], samples: int) -> None:
         self.size_px = size_px

@@ -36,7 +36,7 @@ class LightMaps:
         programs.bind_textures(shadow_map=_SHADOW_MAP, occlusion=_OCCLUSION)
 
     def render_shadow_map(self, geometry: Geometry, sky: Sky) -> dict[str, Any]:
-        """Render the sun's shadow map and return its uniforms, or none if the sun gives no light."""
+        """Render the sun's shadow map and return its uniforms; {} if the sun gives no light."""
         self._frame.use()
         self._frame.clear()
         if not any(sky.sun_light):

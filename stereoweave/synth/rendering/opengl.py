@@ -23,10 +23,10 @@ _TEXTURES, _SAMPLES = 0, 1  # texture units
 class OpenGLRenderer:
     """OpenGL renderer of worlds; implements `pair_rendering.SceneRenderer`.
 
-    The bytes depend on the world and the rig alone, not on earlier renderings. Depth is rasterised
-    separately, at pixel centres. By default the image takes 2x2 samples per pixel, centred on the pixel, and
-    shades each of them. With llvmpipe this takes little more than half the time of multisampling, which also
-    shades surfaces that are covered later. It also smooths highlights and shadow edges.
+    The rendered bytes depend on the world and the rig alone, not on earlier renderings. Depth is rasterised
+    separately, at pixel centres. By default, images have 2x2 samples per pixel, arranged around the pixel's
+    centre, and each sample is shaded. This smooths highlights and shadow edges. With llvmpipe, it takes
+    little more than half the time of multisampling, which also shades surfaces that are covered later.
     """
 
     def __init__(self, effects: Effects = Effects()) -> None:  # noqa: B008, frozen
@@ -82,7 +82,7 @@ class OpenGLRenderer:
     def _render_depth(
         self, geometry: Geometry, triangles: Int[np.ndarray, " k"], rig: PosedRig, position: float
     ) -> tuple[Float[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-        """Render the depth in metres and the mask of the target."""
+        """Render the depth in metres and the target mask."""
         frame = self._frame_buffers(rig).depth
         frame.use()
         frame.clear(red=np.inf)
@@ -118,7 +118,7 @@ class OpenGLRenderer:
         )
 
     def _frame_buffers(self, rig: PosedRig) -> FrameBuffers:
-        """Return frame buffers for the rig's image size; those of the last size are cached."""
+        """Return frame buffers for the rig's image size; those for the last size are cached."""
         if self._last_frame_buffers is None or self._last_frame_buffers.size_px != rig.size_px:
             if self._last_frame_buffers is not None:
                 self._last_frame_buffers.release()
@@ -135,7 +135,7 @@ class OpenGLRenderer:
         return self._geometry
 
     def _set_light(self, world: World, geometry: Geometry) -> None:
-        """Set the materials and the light, which all images of a world share."""
+        """Upload the materials and the lighting that all images of a world share."""
         if world is self._lit_world:
             return
         self._materials.write(world, self._bank)

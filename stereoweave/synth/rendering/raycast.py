@@ -1,6 +1,7 @@
 """Embree ray caster for images and exact depth, slower and plainer than `opengl`.
 
-It is the fallback where OpenGL does not start, and the tests' independent reference for the OpenGL renderer.
+It is the fallback if OpenGL does not start, and the tests use it as an independent reference for the OpenGL
+renderer.
 """
 
 import functools
@@ -21,7 +22,7 @@ from stereoweave.synth.world import Mesh, RenderedView, Sky, World
 
 Vectors = Float[np.ndarray, "p 3"]
 
-# Offset of shadow rays from the surface; prevents self-shadowing by rounding errors.
+# Offset of shadow rays from the surface; prevents self-shadowing due to rounding errors.
 _OFF_M = 2e-3
 
 
@@ -51,7 +52,8 @@ class Raycaster:
     ) -> tuple[Float[np.ndarray, "h w"], Int[np.ndarray, "h w"]]:
         """Cast rays from one point; return the distances and triangle indices of their hits.
 
-        Distances are multiples of the directions' lengths. A ray that hits nothing gets infinity and -1.
+        Distances are multiples of the directions' lengths. If a ray hits nothing, its distance is
+        infinite and its triangle index is -1.
         """
         hits = self._cast(world, eye_m, directions.reshape(-1, 3))
         shape = directions.shape[:2]
@@ -114,7 +116,7 @@ class Raycaster:
         return light
 
     def _sun_visibility(self, world: World, places_m: Vectors) -> Float[np.ndarray, " p"]:
-        """Return 1 where nothing blocks the sun, otherwise 0."""
+        """Return 1 where nothing blocks the sun, and 0 elsewhere."""
         assert self._scene is not None
         towards = np.broadcast_to(np.array(world.sky.sun, np.float32), places_m.shape)
         met = self._scene.run(places_m.astype(np.float32), np.ascontiguousarray(towards))
@@ -126,9 +128,9 @@ class _Hits:
     """The first hit of each ray.
 
     Attributes:
-        triangle: index of the triangle; -1 if the ray hits nothing.
-        distance: multiple of the direction's length; infinite if the ray hits nothing.
-        shares: barycentric coordinates of the hit.
+        triangle: Index of the triangle; -1 if the ray hits nothing.
+        distance: Distance as a multiple of the direction's length; infinite if the ray hits nothing.
+        shares: Barycentric coordinates of the hit.
     """
 
     triangle: Int[np.ndarray, " p"]

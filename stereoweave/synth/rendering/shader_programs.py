@@ -54,7 +54,7 @@ class Programs:
                     program[key] = unit
 
     def set_uniforms(self, name: str, **values: Any) -> None:
-        """Set a program's uniforms, with matrices column by column; unused uniforms are ignored."""
+        """Set a program's uniforms. Matrices are given column by column; unused uniforms are ignored."""
         program = self._programs[name]
         for key, value in values.items():
             uniform = program.get(key, None)

@@ -1,6 +1,6 @@
-"""Geometry for shadows and ambient occlusion: the sun's view, and a grid of surface areas.
+"""Geometry for shadows and ambient occlusion: the sun's view and a grid of surface areas.
 
-Triangles are passed as a contiguous `Mesh.corners_m.T`: axis, corner, triangle.
+Triangles are passed as a contiguous `Mesh.corners_m.T`, indexed by axis, corner and triangle.
 """
 
 from dataclasses import dataclass
@@ -23,16 +23,16 @@ _WIDE_CELLS = 9
 
 @dataclass(frozen=True, kw_only=True)
 class SunView:
-    """The sun's orthographic view: an inner square around the target and a wider concentric one.
+    """The sun's orthographic view: an inner square around the target and a wider, concentric square.
 
     Attributes:
-        to_unit: matrix [3, 4] from (x, y, z, 1) to 0..1 across and down the inner square, and away from the
-            sun.
-        inner_m: side of the inner square.
-        wide: ratio of the wide square's side to the inner square's side.
-        inside: indices of the triangles that cast shadows into the inner square.
-        beyond: indices of the triangles that cast shadows into the wide square and are not entirely in the
-            inner one.
+        to_unit: Matrix [3, 4] from (x, y, z, 1) to coordinates in 0..1: across the inner square, down the
+            inner square, and away from the sun.
+        inner_m: Side of the inner square.
+        wide: Ratio of the wide square's side to the inner square's side.
+        inside: Indices of the triangles that cast shadows into the inner square.
+        beyond: Indices of the triangles that cast shadows into the wide square and are not entirely in the
+            inner square.
     """
 
     to_unit: Float[np.ndarray, "3 4"]
@@ -92,9 +92,10 @@ class OcclusionGrid:
     """Ambient occlusion around the target.
 
     Attributes:
-        share: blocked fraction of the sky, uint8 [CELLS, CELLS, CELLS] indexed z, y, x; 255 is all of it.
-        low_m: corner of the grid with the least coordinates.
-        cell_m: side of a cell.
+        share: Blocked fraction of the sky, uint8 [CELLS, CELLS, CELLS] indexed by z, y and x; 255 means the
+            whole sky.
+        low_m: Corner of the grid with the least coordinates.
+        cell_m: Side of a cell.
     """
 
     share: UInt8[np.ndarray, "z y x"]
@@ -120,8 +121,8 @@ def count_occlusion(corners_m: Corners, target_m: Corners) -> OcclusionGrid:
 def _hidden_share(surface: Float[np.ndarray, "z y x"]) -> UInt8[np.ndarray, "z y x"]:
     """Return the fraction of the sky that nearby surfaces block from each cell.
 
-    Surfaces in the cell itself count most, those in the cube around it less. A plane blocks no sky from
-    points on it, so its area is subtracted from the cube's.
+    Surfaces in the cell itself count most; surfaces in the cube around the cell count less. A plane blocks no
+    sky from points on it, so the area of one plane is subtracted from the area in the cube.
     """
     around = surface
     for axis in range(3):
@@ -136,7 +137,7 @@ def _hidden_share(surface: Float[np.ndarray, "z y x"]) -> UInt8[np.ndarray, "z y
 
 
 def _cut_large(corners_m: Corners, low_m: Float[np.ndarray, "3"], cell_m: float) -> Corners:
-    """Return the triangles that touch the grid, with large ones subdivided so that few samples miss it."""
+    """Return the triangles that touch the grid, large ones subdivided so that few samples lie outside it."""
     done = []
     rest = _select_near(corners_m, low_m, cell_m * CELLS)
     while rest.size:

@@ -1,4 +1,4 @@
-"""Registry of scenes, each of which builds a random stage."""
+"""Registry of scenes: functions that each build a random stage."""
 
 from collections.abc import Callable
 

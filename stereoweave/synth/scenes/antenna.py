@@ -44,10 +44,10 @@ class MastPlan:
     """Dimensions of a mast.
 
     Attributes:
-        corners: number of legs, 3 or 4.
-        widths_m: side lengths at the foot and at the top.
-        guyed: whether the mast is slim and held by guy wires; it is free-standing otherwise.
-        banded: whether the mast is painted in red and white bands.
+        corners: Number of legs, 3 or 4.
+        widths_m: Side lengths at the foot and at the top.
+        guyed: Whether the mast is slim and held by guy wires; otherwise it is free-standing.
+        banded: Whether the mast is painted in red and white bands.
     """
 
     height_m: float

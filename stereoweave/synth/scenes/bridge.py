@@ -60,7 +60,7 @@ def bridge(rng: np.random.Generator) -> Stage:
 
 
 def _orbit(rng: np.random.Generator, plan: BridgePlan) -> Orbit:
-    """Return viewpoints from a boat in mid-river, or higher, oblique ones from a bank."""
+    """Return viewpoints on a boat in mid-river, or higher, oblique viewpoints on a bank."""
     side_deg = 90.0 if rng.random() < 0.5 else 270.0
     centre_m = (0.0, 0.0, plan.level_m + 0.3)
     if rng.random() < 0.4:
@@ -88,7 +88,7 @@ def _street_lamps(rng: np.random.Generator, palette: Palette, plan: BridgePlan) 
 
 
 def _traffic(rng: np.random.Generator, palette: Palette, plan: BridgePlan, fifths: Sequence[int]) -> Mesh:
-    """Build two or more vehicles in two lanes, driving on the right, on the given fifths of the road."""
+    """Build two or more vehicles driving on the right in two lanes, on the given fifths of the road."""
     kinds = [vehicle.transform(np.diag([SCALE, SCALE, SCALE, 1.0])) for vehicle in fleet(rng, palette)]
     slots = rng.permutation([(fifth, lane) for fifth in fifths for lane in (0, 1)])
     placed = []

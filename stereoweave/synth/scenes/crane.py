@@ -38,13 +38,13 @@ PAINTS: tuple[Colour, ...] = (
 
 @dataclass(frozen=True, kw_only=True)
 class TowerCranePlan:
-    """Dimensions of a tower crane; the jib points along x, the counter-jib along -x.
+    """Dimensions of a tower crane; the jib points along x and the counter-jib along -x.
 
     Attributes:
-        ring_m: height of the slewing ring on top of the mast.
-        head_m: height of the tower head above `deck_m`; 0 if there is no head.
-        trolley_m: x coordinate of the trolley.
-        rope_m: length of the rope from the jib to the hook.
+        ring_m: Height of the slewing ring on top of the mast.
+        head_m: Height of the tower head above `deck_m`; 0 if there is no head.
+        trolley_m: The x coordinate of the trolley.
+        rope_m: Length of the rope from the jib to the hook.
     """
 
     ring_m: float

@@ -44,7 +44,7 @@ def figures(rng: np.random.Generator) -> Stage:
 
 
 def _cast(rng: np.random.Generator, palette: Palette, distance_m: float) -> Mesh:
-    """Build figures from close to the cameras, which are at x = distance_m, to behind the centre."""
+    """Build figures between the cameras, which are at x = distance_m, and a point behind the centre."""
     clothes = [draw_clothes(rng, palette) for _ in range(3)]
     kinds = [animal(rng, palette) for _ in range(2)]
     depths_m = np.geomspace(rng.uniform(0.95, 1.8), distance_m + 4, int(rng.integers(3, 8)))
@@ -109,7 +109,7 @@ def _open_air(rng: np.random.Generator, palette: Palette, orbit: Orbit, cast: Me
 
 
 def _soften(rng: np.random.Generator, sky: Sky) -> Sky:
-    """Dim the sun in half of the draws."""
+    """Dim the sun with a probability of one half."""
     share = rng.choice([1.0, rng.uniform(0.1, 0.6)])
 
     def dim(colour: Colour) -> Colour:

@@ -1,6 +1,6 @@
 """Scene `boards`: plain boards, tables and walls near the cameras, among textured objects.
 
-The interior of a plain surface cannot be matched, so its disparity follows from its outlines alone. Real
+The interior of a plain surface cannot be matched, so its disparity follows from the outlines alone. Real
 rooms are full of such surfaces, which are often near the cameras and larger than training crops.
 """
 
@@ -42,10 +42,10 @@ class _Foreground:
     """Plain surfaces near the cameras, with places for objects on them.
 
     Attributes:
-        plain: mesh of the plain surfaces.
-        orbit: viewpoints around a point on the z axis.
+        plain: Mesh of the plain surfaces.
+        orbit: Viewpoints around a point on the z axis.
         spots_m: [N, 4], places for small objects: x, y, z and size.
-        end_m: y at which the foreground ends; the room continues behind it.
+        end_m: The y coordinate at which the foreground ends; the room continues behind it.
     """
 
     plain: Mesh
@@ -179,7 +179,7 @@ def _orbit(rng: np.random.Generator, distance_m: float, aim_m: float, elevation_
 
 
 def _plain(rng: np.random.Generator) -> Material:
-    """Draw a material of one muted colour; 30 % of the draws have faint noise and 25 % are glossy."""
+    """Draw a material of one muted colour; 30 % of such materials have faint noise and 25 % are glossy."""
     even = rng.random() < 0.7
     return Material(
         texture="plain",
@@ -202,7 +202,7 @@ def _spots(
     level_m: float,
     sizes: tuple[float, float],
 ) -> Float[np.ndarray, "n 4"]:
-    """Draw a spot at each y, across the view's width; sizes are fractions of the distance to the cameras."""
+    """Draw a spot across the view at each y; sizes are fractions of the distance to the cameras."""
     away_m = along_m + distance_m
     x = rng.permutation(np.linspace(-1.3, 1.3, len(along_m))) * _HALF_VIEW * away_m
     sizes_m = rng.uniform(*sizes, len(along_m)) * away_m
@@ -231,7 +231,7 @@ def _thing(rng: np.random.Generator, skins: Sequence[int], spot_m: Float[np.ndar
 
 
 def _light(rng: np.random.Generator, lamps: Sequence[Lamp]) -> tuple[Sky, float]:
-    """Draw ambient light from walls and ceiling, without sun; return it with a suitable exposure."""
+    """Draw ambient light from the walls and the ceiling, without sun, and a suitable exposure."""
     ambient = rng.uniform(0.25, 0.6)
     tint = np.array([1.0, 0.97, 0.92]) * rng.uniform(0.96, 1.04, 3)
 

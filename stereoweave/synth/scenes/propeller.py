@@ -1,4 +1,4 @@
-"""Scene `propeller`: a ship's propeller in a dry dock or a yard, or as a monument. Aft is +x."""
+"""Scene `propeller`: a ship's propeller in a dry dock or a yard, or on display as a monument. Aft is +x."""
 
 from dataclasses import dataclass, replace
 
@@ -82,7 +82,7 @@ def _draw_finish(rng: np.random.Generator) -> Material:
 
 
 def _turn_sun_aft(rng: np.random.Generator, sky: Sky) -> Sky:
-    """Rotate the sun aft in most draws, so that it shines under the hull onto the blades."""
+    """Rotate the sun aft in most cases, so that it shines under the hull onto the blades."""
     if rng.random() < 0.15:
         return sky
     level, azimuth = np.hypot(*sky.sun[:2]), np.radians(rng.uniform(-65, 65))
@@ -131,7 +131,7 @@ def _park(rng: np.random.Generator, palette: Palette, propeller: Propeller) -> _
 
 
 def _plinth(rng: np.random.Generator, palette: Palette, propeller: Propeller, floor_m: float) -> Mesh:
-    """Build two steps, a tapering pier behind the hub, a plaque, and a chain around them."""
+    """Build two steps, a tapering pier behind the hub, a plaque, and a chain around the plinth."""
     texture = str(rng.choice(["stone", "concrete", "brick"]))
     stone = palette.add(
         Material(texture=texture, variant=int(rng.integers(64)), tint=vary_colour(rng, (0.8, 0.78, 0.74)))
@@ -159,7 +159,7 @@ def _plinth(rng: np.random.Generator, palette: Palette, propeller: Propeller, fl
 
 
 def _path(rng: np.random.Generator, palette: Palette) -> Mesh:
-    """Build a paved circle around the plinth and a path to it."""
+    """Build a paved circle around the plinth, and a path leading to the circle."""
     paving = palette.add(
         Material(
             texture=str(rng.choice(["gravel", "stone", "concrete"])),

@@ -39,14 +39,14 @@ REACH_M = 4.4  # lines within this distance of the tower's middle belong to the 
 
 @dataclass(frozen=True, kw_only=True)
 class PylonPlan:
-    """Dimensions of a tower; the line runs along y, the arms along x.
+    """Dimensions of a tower; the line runs along y and the arms along x.
 
     Attributes:
-        arms: height_m, reach_m and number of conductors on each side for each arm, from the lowest up.
-        widths_m: widths of the body at the ground, at the lowest arm and at the highest arm.
-        span_m: distance to the next tower.
-        strained: whether tension insulators along the line replace suspension insulators.
-        bundle_m: distance between the wires of a twin bundle; 0 for single wires.
+        arms: For each arm, from the lowest up, its height_m, reach_m and number of conductors per side.
+        widths_m: Widths of the body at the ground, at the lowest arm and at the highest arm.
+        span_m: Distance to the next tower.
+        strained: Whether tension insulators along the line replace suspension insulators.
+        bundle_m: Distance between the wires of a twin bundle; 0 for single wires.
     """
 
     height_m: float
@@ -128,7 +128,7 @@ def _trusses(plan: PylonPlan) -> list[Truss]:
 
 
 def _arm(plan: PylonPlan, height_m: float, reach_m: float) -> Float[np.ndarray, "k 4 3"]:
-    """Return the joints of an arm from body to tip; the first two of each ring are the lower ones."""
+    """Return an arm's rings of four joints, from body to tip; the first two of each are the lower joints."""
     low, high = (_width(plan, z) / 2 for z in (height_m, height_m + plan.depth_m))
     top = height_m + plan.depth_m
     root = np.array([[low, -low, height_m], [low, low, height_m], [high, high, top], [high, -high, top]])

@@ -48,7 +48,7 @@ class QuayCraneMaterials:
 
 
 def quay_crane(rng: np.random.Generator) -> Stage:
-    """Build a stage with a container crane on a quay along y, its boom along x."""
+    """Build a stage with a container crane on a quay along y, with its boom along x."""
     palette = Palette()
     materials = _draw_materials(rng, palette)
     colours = [palette.add(painted_steel(rng, colour, roughness=0.6)) for colour in BOXES]
@@ -56,7 +56,8 @@ def quay_crane(rng: np.random.Generator) -> Stage:
         [_portal(materials), _boom(materials), _stays(materials), _trolley(rng, materials, colours)]
     )
     mesh = join_meshes([crane.as_target(), _quay(rng, palette, colours)])
-    # The viewpoints are on one side, which shows boom and portal in profile; mirroring adds the other side.
+    # The viewpoints are on one side, which shows the boom and the portal in profile. Mirroring adds the other
+    # side.
     mirrored = rng.random() < 0.5
     light = daylight(rng)
     mesh = _mirror(mesh) if mirrored else mesh
@@ -252,7 +253,7 @@ def _quay(rng: np.random.Generator, palette: Palette, colours: list[int]) -> Mes
 
 
 def _ship(rng: np.random.Generator, palette: Palette, colours: list[int], dark: int) -> Mesh:
-    """Build a container ship alongside: its bow is beyond the crane, its bridge and containers are astern."""
+    """Build a container ship along the quay, with its bow just past the crane and its containers astern."""
     hull = palette.add(
         painted_steel(rng, ((0.08, 0.12, 0.2), (0.3, 0.06, 0.05), (0.07, 0.2, 0.15))[int(rng.integers(3))])
     )

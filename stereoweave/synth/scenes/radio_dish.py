@@ -55,7 +55,7 @@ def radio_dish(rng: np.random.Generator) -> Stage:
 
 
 def _far(rng: np.random.Generator, white: int, measures: tuple[float, float, float]) -> Mesh:
-    """Build simplified, distant dishes of the same dimensions (radius, axis height, elevation)."""
+    """Build simplified, distant dishes, given the radius, axis height and elevation."""
     radius, axis, upwards_deg = measures
     reflector = paraboloid(radius, 0.8 * radius, white, white, 20)
     dish = [
@@ -125,7 +125,7 @@ def _seams(radius_m: float, focal_m: float) -> Float[np.ndarray, "n 2 3"]:
 
 
 def _ribs(radius_m: float, focal_m: float) -> Float[np.ndarray, "n 2 3"]:
-    """Return the bars behind the reflector: radial ribs of chords, posts and braces, and rings."""
+    """Return the bars behind the reflector: rings, and radial ribs of chords, posts and braces."""
     radius = np.linspace(0.18, 0.98, 6) * radius_m
     angle = np.arange(RIBS) * 2 * np.pi / RIBS
     across = radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
@@ -183,7 +183,7 @@ def _pedestal(axis_m: float, skins: tuple[int, int, int, int]) -> Mesh:
 
 
 def _alidade(axis_m: float, skins: tuple[int, int, int, int]) -> Mesh:
-    """Build a lattice that turns on wheels on a circular rail, with a ladder."""
+    """Build a lattice mount with a ladder; the mount turns on wheels on a circular rail."""
     white, steel, concrete, dark = skins
     top, wide = axis_m - 0.75, 1.05
     corner = np.array([[1, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0]])

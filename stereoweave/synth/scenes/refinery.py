@@ -40,7 +40,7 @@ UNITS: dict[str, Callable[[np.random.Generator, RefineryMaterials], RefineryUnit
     "chimney": chimney,
     "flare": flare,
 }
-# Least and greatest number of each unit, enough for people to recognise a refinery.
+# Least and greatest number of units of each kind, enough for people to recognise a refinery.
 _COUNTS = {
     "column": (3, 3),
     "ball tank": (1, 2),
@@ -53,7 +53,7 @@ _PLOTS_X_M = (-2.7, -0.9, 0.9, 2.7)
 _PLOTS_Y_M = (-2.75, -1.4, 1.4, 2.75)
 _HALF_RACK_M = 3.3
 _YARD_M = 13.5  # half of the yard's side
-# Props of the surroundings are built at real size; this shrinks them to the refinery's scale.
+# Props of the surroundings are built at real size; this factor shrinks them to the refinery's scale.
 _SMALL = np.diag([0.3, 0.3, 0.3, 1.0])
 
 

@@ -68,7 +68,7 @@ def _draw_antenna(rng: np.random.Generator, skins: tuple[int, int, int]) -> tupl
     if kind == "yagi":
         return yagi(rng.uniform(0.8, 1.3), int(rng.integers(9, 16)), steel, dark), 0.5
     if kind == "wide":
-        # An antenna for long waves: it has a few rods, as long as its boom.
+        # An antenna for long waves has few rods, which are as long as its boom.
         broad = yagi(0.45, 4, steel, dark)
         return broad.transform(np.diag([2.2, 2.2, 2.2, 1.0])), 0.85
     if kind == "dish":
@@ -92,7 +92,7 @@ def _tripod(steel: int) -> Mesh:
 
 
 def _roof(rng: np.random.Generator, palette: Palette, feet: np.ndarray, dark: int) -> Mesh:
-    """Build the building with its parapet, chimneys, vents, stair shed, cooling units and cables."""
+    """Build the house with its parapet, chimneys, vents, stair shed, cooling units and cables."""
     gravel = palette.add(
         Material(
             texture=str(rng.choice(["gravel", "asphalt", "concrete"])),

@@ -140,7 +140,7 @@ def _ground(rng: np.random.Generator) -> Stage:
 
 
 def _far_off(rng: np.random.Generator, palette: Palette) -> Sequence[Mesh]:
-    """Build a random choice of distant hills, houses and rocks."""
+    """Build a random selection of distant hills, houses and rocks."""
     far = []
     if rng.random() < 0.6:
         far.append(hills(rng, palette, distance_m=rng.uniform(70, 130)))

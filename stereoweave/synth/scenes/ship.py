@@ -47,7 +47,7 @@ def ship(rng: np.random.Generator) -> Stage:
     return outdoor_stage(mesh, palette, light, orbit)
 
 
-# Colours of hull, stripe, bottom, house and trim, as real fleets use them.
+# Colours of hull, stripe, bottom, house and trim, as used by real fleets.
 _LIVERIES: tuple[tuple[Colour, Colour, Colour, Colour, Colour], ...] = (
     ((0.05, 0.06, 0.07), (0.9, 0.9, 0.87), (0.42, 0.1, 0.07), (0.9, 0.88, 0.82), (0.6, 0.3, 0.08)),
     ((0.06, 0.13, 0.28), (0.9, 0.9, 0.87), (0.4, 0.11, 0.08), (0.95, 0.95, 0.93), (0.62, 0.12, 0.08)),
@@ -182,7 +182,7 @@ def _roof_rails(plan: ShipPlan, materials: ShipMaterials) -> Mesh:
 
 
 def _forward(plan: ShipPlan, materials: ShipMaterials) -> Mesh:
-    """Build the windlass, bitts, vents and anchors of the forecastle."""
+    """Build the windlass, bitts, vents and anchors on the forecastle."""
     hull = plan.hull
     bow = hull.length_m / 2
     ends = np.array([[0.14], [0.76]])

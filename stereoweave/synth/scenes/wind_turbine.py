@@ -51,9 +51,9 @@ class TurbinePlan:
     """Dimensions of a wind turbine.
 
     Attributes:
-        foot_m: height of the tower's foot, which is on the ground or, at sea, on a platform.
-        hub_m: height of the tower's top.
-        radii_m: radii of the tower at its foot and top; half the widths of a lattice tower.
+        foot_m: Height of the tower's foot, which is on the ground or, at sea, on a platform.
+        hub_m: Height of the tower's top.
+        radii_m: Radii of the tower at its foot and top; half the widths of a lattice tower.
     """
 
     kind: str
@@ -64,7 +64,7 @@ class TurbinePlan:
 
 
 def wind_turbine(rng: np.random.Generator) -> Stage:
-    """Build a stage with a turbine, about 6.5 m high and with its rotor facing +x, or a wind pump of 5 m."""
+    """Build a stage with a turbine about 6.5 m high, whose rotor faces +x, or with a wind pump of 5 m."""
     kind = str(rng.choice(list(KINDS), p=list(KINDS.values())))
     return _wind_pump(rng) if kind == "pump" else _turbine(rng, kind)
 
@@ -104,7 +104,7 @@ def _turbine(rng: np.random.Generator, kind: str) -> Stage:
     land = (_sea if kind == "sea" else _fields)(rng, palette, plan, materials)
     mesh = join_meshes([join_meshes(parts).as_target(), land])
     top_m = plan.hub_m + plan.rotor.radius_m
-    # Seen from the front or from behind, because a rotor is only a line when seen from the side.
+    # The cameras are in front or behind, because a rotor is only a line when seen from the side.
     front = float(rng.choice([0, 180], p=[0.7, 0.3]))
     orbit = Orbit(
         centre_m=(0.0, 0.0, 0.5 * top_m),

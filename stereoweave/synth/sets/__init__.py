@@ -1,1 +1,1 @@
-"""Sets of rendered pairs: making and checking them, and contact sheets."""
+"""Rendering and checking of sets of pairs, and contact sheets of scenes."""

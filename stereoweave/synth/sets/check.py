@@ -1,4 +1,4 @@
-"""Verification of sets: checksums, and disparities against the images and each other."""
+"""Verification of a set's checksums, and of its disparities against the images and against each other."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -25,8 +25,8 @@ _WIDEST_BAR = 40
 _PAIRS_A_TASK = 20
 # Rounding of the stored disparities contributes at most 0.002 px.
 _AGREE_PX = 0.05
-# Measured on all scenes: correct pairs agree at 98 % of the pixels or more at 64x48, 99.1 % at 160x120 and
-# 99.9 % at 640x480. If one of the two maps is off by 0.1 px, they agree at 29 % or less.
+# Measured on all scenes: correct pairs agree at no less than 98 % of the pixels at 64x48, 99.1 % at 160x120
+# and 99.9 % at 640x480. If one of the two maps is off by 0.1 px, they agree at 29 % or less.
 _LEAST_AGREEING = 0.95
 # Ratio of the image difference at the disparity to the difference 1 px beside it. At these sizes it is at
 # most 0.90, 0.76 and 0.66 for correct pairs, at least 1.1 if the disparity is off by 1 px, and at least 0.99
@@ -41,20 +41,21 @@ _JUMP_PX = 0.5
 
 @dataclass(frozen=True, kw_only=True)
 class Findings:
-    """Statistics and problems of checked pairs; instances can be added.
+    """Statistics and problems of checked pairs; instances can be summed.
 
     Attributes:
-        pairs: number of pairs.
-        disparity: histogram [10] of the left views' known disparities.
-        depth: histogram [11] of the depths at the same pixels; the last bin includes the sky.
-        unknown: number of pixels without ground truth.
-        occluded: number of pixels that only the left camera sees.
-        grey_levels: sums [3] over the compared pairs of the mean grey-level difference between the left image
-            and the right one warped by the disparity minus 1 px, plus 0 px and plus 1 px.
-        compared: number of pairs whose images were compared; the others have too few near surfaces.
-        agreeing: fraction of the pixels at which both disparities agree, summed over the matched pairs.
-        matched: number of pairs whose two disparities could be compared.
-        problems: one line per problem.
+        pairs: Number of pairs.
+        disparity: Histogram [10] of the left views' known disparities.
+        depth: Histogram [11] of the depths at the same pixels; the last bin includes the sky.
+        unknown: Number of pixels without ground truth.
+        occluded: Number of pixels that only the left camera sees.
+        grey_levels: Sums [3], over the compared pairs, of the mean grey-level difference between the left
+            image and the right image warped by the disparity minus 1 px, the disparity, and the disparity
+            plus 1 px.
+        compared: Number of pairs whose images were compared; the others have too few near surfaces.
+        agreeing: Fraction of the pixels at which the two disparities agree, summed over the matched pairs.
+        matched: Number of pairs whose two disparities could be compared.
+        problems: One line per problem.
     """
 
     pairs: int
@@ -73,7 +74,7 @@ class Findings:
 
 
 class _Pairs(NamedTuple):
-    """Names and files of the pairs, and a function that reads a pair.
+    """Name and file of each pair, and a function that reads a pair.
 
     In the paper's layout, each frame counts as one file.
     """
@@ -91,10 +92,10 @@ class _Pairs(NamedTuple):
 
 
 def check_set(folder: Path, jobs: int = 1, console: Console | None = None) -> Findings:
-    """Check all pairs of a set; the findings have no `problems` if the set is intact.
+    """Check all pairs of a set; if the set is intact, the findings contain no problems.
 
     Raises:
-        FormatError: The folder holds no set, or the sequence of its files has a gap.
+        FormatError: The folder contains no set, or its sequence of shards has a gap.
     """
     facts = read_set(folder)
     pairs = _open_pairs(folder, facts["layout"], facts["scene"])
@@ -110,7 +111,7 @@ def check_set(folder: Path, jobs: int = 1, console: Console | None = None) -> Fi
 
 
 def report_lines(found: Findings) -> Iterator[str]:
-    """Yield the report's lines: statistics, histograms of disparity and depth, problems, and their number."""
+    """Yield the report line by line: statistics, histograms, problems, and the number of problems."""
     if found.pairs:
         yield from _statistics(found)
     yield from found.problems
@@ -119,20 +120,20 @@ def report_lines(found: Findings) -> Iterator[str]:
 
 
 def find_problem(sample: Sample) -> str | None:
-    """Return the first inconsistency between a pair's disparities and images, or None."""
+    """Return the first inconsistency between a pair's disparities and images, or None if they agree."""
     if not np.isfinite(sample.disparity_px).any():
-        return "expected known disparities, found every pixel unknown"
+        return "expected known disparities, found none"
     before, at, after = _measure_differences(sample)
     if at > _LARGEST_RATIO * min(before, after):
         return (
-            "expected both images to differ least at the disparity, found differences of "
+            "expected the images to differ least at the disparity, found differences of "
             f"{at:.2f} grey levels at the disparity, {before:.2f} at 1 px less and {after:.2f} at 1 px more"
         )
     agreeing = _measure_agreement(sample)
     if agreeing < _LEAST_AGREEING:
         return (
-            f"expected both disparities to agree at {_LEAST_AGREEING:.0%} of the pixels that both cameras "
-            f"see, found {agreeing:.1%}"
+            f"expected the two disparities to agree at {_LEAST_AGREEING:.0%} or more of the pixels that both "
+            f"cameras see, found {agreeing:.1%}"
         )
     return None
 
@@ -207,9 +208,9 @@ def _measure(sample: Sample, problem: str | None) -> Findings:
 
 
 def _measure_differences(sample: Sample) -> Float[np.ndarray, "3"]:
-    """Return the images' mean differences at the disparity minus 1 px, plus 0 px and plus 1 px.
+    """Return the mean image differences at 1 px less than the disparity, at the disparity, and at 1 px more.
 
-    Only near surfaces seen by both cameras count; NaN if they cover too few pixels.
+    Only near surfaces seen by both cameras count. The result is NaN if they cover too few pixels.
     """
     left, right = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (sample.left, sample.right))
     columns = _find_matches(sample)
@@ -227,11 +228,11 @@ def _measure_differences(sample: Sample) -> Float[np.ndarray, "3"]:
 
 
 def _measure_agreement(sample: Sample) -> float:
-    """Return the fraction of pixels, among those seen by both cameras, at which both disparities agree.
+    """Return the fraction of pixels, among those seen by both cameras, at which the two disparities agree.
 
-    Pixels at disparity jumps are excluded; NaN if too few pixels remain. A disparity agrees if it lies
-    between the right view's values at the two columns next to its match. This tolerates a crease between
-    these columns, where no interpolation would be right.
+    Pixels at disparity jumps are excluded; the result is NaN if too few pixels remain. A left disparity
+    agrees if it lies between the right view's disparities at the two columns next to its match. This
+    tolerates a crease between these columns, where any interpolation would be wrong.
     """
     columns = _find_matches(sample)
     inside = (columns >= 0) & (columns <= columns.shape[1] - 1)
@@ -256,7 +257,7 @@ def _find_matches(sample: Sample) -> Float[np.ndarray, "h w"]:
 
 
 def _find_level(disparity_px: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Return the mask of pixels without a disparity jump or an unknown disparity at an adjacent column."""
+    """Return the mask of pixels without a disparity jump or an unknown disparity in an adjacent column."""
     padded_px = np.pad(disparity_px, ((0, 0), (1, 1)), mode="edge")
     level = np.abs(np.diff(padded_px, axis=1)) <= _JUMP_PX
     return level[:, 1:] & level[:, :-1]
@@ -270,16 +271,16 @@ def _count(values: Float[np.ndarray, "*n"], edges: tuple[float, ...]) -> Int[np.
 def _statistics(found: Findings) -> Iterator[str]:
     pixels = found.disparity.sum() + found.unknown
     yield f"{found.pairs} pair{'s' * (found.pairs > 1)}"
-    yield f"occluded {found.occluded / pixels:.1%}, unknown {found.unknown / pixels:.1%} of left view pixels"
+    yield f"occluded {found.occluded / pixels:.1%}, unknown {found.unknown / pixels:.1%} of left-view pixels"
     if found.compared:
         before, at, after = found.grey_levels / found.compared
         yield (
             f"images differ by {at:.2f} grey levels at the disparity, "
-            f"{before:.2f} at 1 px less, {after:.2f} at 1 px more"
+            f"{before:.2f} at 1 px less and {after:.2f} at 1 px more"
         )
     if found.matched:
         share = found.agreeing / found.matched
-        yield f"disparities agree within {_AGREE_PX} px at {share:.3%} of shared pixels, edges excluded"
+        yield f"disparities agree within {_AGREE_PX} px at {share:.3%} of shared pixels, excluding edges"
     yield from _histogram("disparity", "px", _DISPARITY_EDGES_PX, found.disparity)
     yield from _histogram("depth", "m", _DEPTH_EDGES_M, found.depth)
 

@@ -1,4 +1,4 @@
-"""Contact sheets: one row per scene, or unlabelled images as a quiz."""
+"""Contact sheets with one row per scene, and quizzes of unlabelled images."""
 
 from collections.abc import Iterator, Sequence
 
@@ -32,7 +32,10 @@ def contact_sheet(
 def quiz_sheet(
     renderer: SceneRenderer, scenes: Sequence[str], seed: int, pictures: int = 16
 ) -> tuple[UInt8[np.ndarray, "h w 3"], list[str]]:
-    """Render unlabelled left images in random order, four per row; return the sheet and its scenes by row."""
+    """Render unlabelled left images in random order, four per row; return the sheet and the scene names.
+
+    The names are in the order of the images, row by row.
+    """
     order = np.random.default_rng(seed).permutation(
         [scenes[place % len(scenes)] for place in range(pictures)]
     )

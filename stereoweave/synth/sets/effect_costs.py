@@ -21,7 +21,7 @@ _OFF = {
 
 @dataclass(frozen=True, kw_only=True)
 class Cost:
-    """Rendering time of a pair on one core, in milliseconds: an effect's share or a total."""
+    """Rendering time of a pair on one core, in milliseconds: the share of one effect, or a total."""
 
     effect: str
     ms_a_pair: float
@@ -30,7 +30,7 @@ class Cost:
 def measure_effect_costs(
     scene: str = "propeller", pairs: int = 3, size_px: tuple[int, int] = (640, 480)
 ) -> list[Cost]:
-    """Measure the time with all effects, the share of each effect, and the time without any.
+    """Measure the time with all effects, the share of each effect, and the time without effects.
 
     The time for building the scene is excluded.
     """
@@ -51,7 +51,7 @@ def measure_effect_costs(
 
 
 def _ms_a_pair(effects: Effects, views: list[tuple[World, PosedRig]]) -> float:
-    """Return the time of a pair in ms: the mean, over the pairs, of the faster of two runs.
+    """Return the mean time per pair in ms, using the faster of two runs for each pair.
 
     Each run renders a world that is new to the renderer, so nothing is cached.
     """

@@ -29,7 +29,7 @@ from stereoweave.system.ray_engine import Engine
 
 SET_FILE = "set.json"
 FORMAT = 1
-# At 640x480 a shard has 50 MB, enough for reading at full disk speed, and takes half a minute to make.
+# At 640x480, such a shard has 50 MB, enough to be read at full disk speed, and takes half a minute to make.
 PAIRS_A_SHARD = 50
 # Each frame has its own files, so runs can be short, which keeps every worker busy.
 _FRAMES_A_RUN = 4
@@ -43,10 +43,13 @@ _PACKAGES = ("moderngl", "numpy", "opencv-python-headless", "pillow", "scikit-im
 
 @runtime_checkable
 class PairMaker(Protocol):
-    """A maker of pairs, which is pickled and sent to worker processes."""
+    """Protocol for makers of pairs, which are pickled and sent to worker processes."""
 
     def renderer(self) -> str:
-        """Return the renderer's name; name, spec and generator version determine the bytes of a pair."""
+        """Return the renderer's name.
+
+        The name, the spec and the generator version determine the bytes of a pair.
+        """
         ...
 
     def __call__(self, spec: RenderSpec, index: int) -> RenderedPair: ...
@@ -59,7 +62,7 @@ class PairRenderer:
     plain: bool = False
 
     def renderer(self) -> str:
-        # In a short-lived process, because a renderer needs a lot of memory.
+        # Ask in a short-lived process, because a renderer needs a lot of memory.
         (name,) = run_in_workers(
             _renderer_name, [self.plain], 1, Console(quiet=True), "starting the renderer", 1
         )
@@ -70,13 +73,14 @@ class PairRenderer:
 
 
 class StorageFormat(NamedTuple):
-    """A storage layout of pairs in a folder.
+    """A layout for storing pairs in a folder.
 
     Attributes:
-        whole_pairs: function that returns the numbers of a scene's complete pairs.
-        write: function that writes a run of pairs as they arrive.
-        remove_unfinished: function that deletes partly written files.
-        pairs_a_run: most pairs that a worker makes in one task; no run crosses a multiple of this number.
+        whole_pairs: Function that returns the numbers of a scene's complete pairs.
+        write: Function that writes a run of pairs as they arrive.
+        remove_unfinished: Function that deletes partly written files.
+        pairs_a_run: Greatest number of pairs that a worker makes in one task; no run crosses a multiple of
+            this number.
     """
 
     whole_pairs: Callable[[Path, str], set[int]]
@@ -101,18 +105,18 @@ def make(  # noqa: PLR0913 - mirrors the command's options
     Args:
         spec: Specification of the pairs.
         pairs: Number of pairs in the finished set.
-        out: Folder of a new set, or of one to resume.
+        out: Folder of a new set, or of a set to resume.
         layout: A name in LAYOUTS.
         jobs: Number of worker processes; it does not affect the bytes written.
-        engine: Cluster to use instead of local processes; all its machines must see `out`. It does not
-            affect the bytes written. The tasks of killed workers are repeated.
+        engine: Cluster to use instead of local processes; all its machines must see `out`. Using a cluster
+            does not affect the bytes written. The tasks of killed workers are repeated.
         pair_maker: Maker of the pairs.
         console: Console that shows the progress.
 
     Raises:
         StereoweaveError: An argument is invalid; `out` holds another set, is in use or cannot be written; the
             disk is full; a worker was killed; or a machine does not see `out` or would make different pairs.
-            All finished pairs are complete even then, and the same call resumes.
+            Even then, all finished pairs are complete, and the same call resumes the work.
     """
     _check(spec, pairs, layout)
     make_folder(out)
@@ -135,7 +139,7 @@ def make(  # noqa: PLR0913 - mirrors the command's options
                 _check_shared(out, _missing_pairs(spec, pairs, out, layout))
         except StereoweaveError as error:
             raise error.with_detail(
-                "all finished pairs are complete: rerun the same command to resume"
+                "all finished pairs are complete; rerun the same command to resume"
             ) from error
         finally:
             LAYOUTS[layout].remove_unfinished(out)
@@ -146,7 +150,7 @@ def read_set(folder: Path) -> dict[str, Any]:
     """Read a set's description: spec, layout, generator, renderer and number of pairs.
 
     Raises:
-        FormatError: The folder holds no set, a set of another format version, or a damaged description.
+        FormatError: The folder contains no set, a set of another format version, or a damaged description.
     """
     path = folder / SET_FILE
     with reading(path, "the description of a set made by stereoweave synth make"):
@@ -161,7 +165,7 @@ def read_set(folder: Path) -> dict[str, Any]:
 
 
 def generator_version() -> str:
-    """Return a hash (8 hexadecimal digits) of the sources that make pairs and of their packages' versions."""
+    """Return a hash (8 hexadecimal digits) of the source files and package versions that determine a pair."""
     folder = Path(__file__).parents[1]
     sources = sorted(path for path in folder.rglob("*.*") if path.suffix != ".pyc" and path.is_file())
     sources = [path for path in sources if path.name not in _EXCLUDED_SOURCES]
@@ -199,8 +203,8 @@ def _check(spec: RenderSpec, pairs: int, layout: str) -> None:
     for position in spec.views:
         if not FIRST_POSITION <= position <= LAST_POSITION:
             raise StereoweaveError(
-                f"expected positions from {FIRST_POSITION} to {LAST_POSITION} (0 is the left camera, "
-                f"1 the right one), found {position}",
+                f"expected positions from {FIRST_POSITION} to {LAST_POSITION} (0 is the left camera "
+                f"and 1 the right one), found {position}",
                 setting="views",
             )
     names = {f"{position:.2f}" for position in spec.views}
@@ -245,7 +249,7 @@ def _missing_pairs(spec: RenderSpec, pairs: int, out: Path, layout: str) -> list
 def _prepare_node(
     spec: RenderSpec, out: Path, layout: str, pair_maker: PairMaker
 ) -> Callable[[Sequence[int]], int]:
-    """Check that this node sees the set and would make the same pairs. Returns a function that makes runs."""
+    """Check that this node sees the set and would make the same pairs; return a function that makes runs."""
     try:
         found = read_set(out)
         del found["pairs"]
@@ -262,7 +266,7 @@ def _check_shared(out: Path, lacking: Sequence[int]) -> None:
     if lacking:
         raise StereoweaveError(
             f"{out}: expected all pairs that the cluster made, found {len(lacking)} of them missing; "
-            "check that all nodes share the disk"
+            "check that all nodes share the folder"
         )
 
 

@@ -1,4 +1,4 @@
-"""Rendering of single pairs: stage, rig, images and exact ground truth."""
+"""Rendering of individual pairs: stage, rig, images and exact ground truth."""
 
 import zlib
 from collections.abc import Callable, Sequence
@@ -25,8 +25,8 @@ from stereoweave.synth.world import RenderedView, World
 
 # This quantile of depth determines the baseline, so a single blade of grass does not count.
 _NEAREST_SHARE = 0.01
-# Seen from either camera, even a wire (this quantile of depth) counts if its disparity exceeds the drawn one
-# by this factor.
+# Seen from either camera, even a wire (this quantile of depth) counts if its disparity exceeds the drawn
+# disparity by this factor.
 _WIRE_SHARE, _EXCESS = 0.002, 1.25
 # A small image suffices to find the nearest surface.
 _LOOK_WIDTH_PX = 160
@@ -34,7 +34,7 @@ _LOOK_WIDTH_PX = 160
 
 @runtime_checkable
 class SceneRenderer(Protocol):
-    """A renderer of worlds: `OpenGLRenderer`, or `Raycaster`, which is slower and plainer."""
+    """Protocol for renderers of worlds: `OpenGLRenderer`, and `Raycaster`, which is slower and plainer."""
 
     @property
     def name(self) -> str: ...
@@ -49,12 +49,12 @@ class RenderSpec:
     """Specification of the pairs of a set.
 
     Attributes:
-        scene: a name in SCENES.
-        seed: seed of all random draws, together with the scene's name and the pair's index.
-        size_px: width and height.
-        frames: number of consecutive pairs that form a video of one world from a moving camera; 1 for stills.
-        views: positions of additional views between or beyond the two cameras, such as 0.5.
-        rig: focal length in pixels and baseline in metres of all pairs; None draws both for each world.
+        scene: A name in SCENES.
+        seed: Seed of all random numbers, combined with the scene's name and the pair's index.
+        size_px: Width and height of the images.
+        frames: Number of consecutive pairs that form a video of one world from a moving camera; 1 for stills.
+        views: Positions of additional views between or beyond the two cameras, such as 0.5.
+        rig: Focal length in pixels and baseline in metres of all pairs; if None, both are drawn per world.
     """
 
     scene: str
@@ -76,8 +76,8 @@ class RenderedPair:
     """A rendered pair with its ground truth.
 
     Attributes:
-        sample: the pair, its disparities (0 for the sky), occlusion masks and camera.
-        views: position and rendering of each additional view.
+        sample: The pair, its disparities (0 for the sky), occlusion masks and camera.
+        views: Position and rendering of each additional view.
     """
 
     sample: Sample
@@ -144,17 +144,17 @@ def _add_noise(
 def _choose_baseline_m(
     renderer: SceneRenderer, world: World, rigs: Callable[[float], Sequence[PosedRig]], metres_px: float
 ) -> float:
-    """Return the baseline in metres that gives the nearest surface the wanted disparity.
+    """Return the baseline in metres that gives the nearest surface the desired disparity.
 
-    The nearest surface is the one seen from the rig's centre. Seen from the cameras, another surface may be
-    nearer. If its disparity exceeds the wanted one by more than a quarter, the baseline is shortened to that
-    limit.
+    The nearest surface is determined from the rig's centre. Seen from the cameras, another surface may be
+    nearer. The baseline is shortened if necessary, so that the disparity of such a surface exceeds the
+    desired disparity by at most a quarter.
 
     Args:
         renderer: Renderer that measures depth.
         world: The world to look at.
         rigs: Function that returns the rigs for a baseline in metres.
-        metres_px: Wanted disparity divided by focal length, which is the baseline per metre of depth.
+        metres_px: Desired disparity divided by focal length, which is the baseline per metre of depth.
     """
 
     def nearest_m(baseline_m: float, positions: Sequence[float], share: float) -> float:

@@ -1,4 +1,4 @@
-"""Choice of a renderer: OpenGL where it works, otherwise ray casting."""
+"""Choice of renderer: OpenGL if it works, otherwise ray casting."""
 
 import warnings
 from functools import cache
@@ -12,7 +12,7 @@ _PACKAGES = "on Debian, apt install libegl1 libgl1-mesa-dri"
 
 @cache
 def shared_renderer(plain: bool = False) -> SceneRenderer:
-    """Return this process's renderer, the best one that starts; `plain` turns all effects off."""
+    """Return the best renderer that starts, shared within this process; `plain` turns all effects off."""
     return choose_renderer(PLAIN if plain else Effects())
 
 

@@ -84,7 +84,7 @@ def run_in_engine(  # noqa: PLR0913 - see `run_in_workers`
     Args:
         make_work: Function called once in each worker. It returns the function that does a task and
             returns the task's number of steps.
-        tasks: Arguments of that function, one for each call.
+        tasks: Arguments of the returned function, one for each call.
         engine: Cluster that runs the workers.
         console: Console that shows the progress.
         description: Label of the progress bar.
@@ -119,5 +119,6 @@ def _begin_in_engine(make_work: Callable[[], Callable[[Task], int]]) -> Callable
 
 
 def _draw_with_one_thread() -> None:
-    # Mesa reads this variable when it creates its first context. More threads than cores would slow all down.
+    # Mesa reads this variable when it creates its first context. More threads than cores would slow down
+    # all of them.
     os.environ["LP_NUM_THREADS"] = "1"

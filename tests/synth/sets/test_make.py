@@ -116,7 +116,7 @@ def test_a_set_describes_itself(finished):
 def test_a_killed_worker_is_a_one_line_error_and_the_same_call_resumes_to_the_same_bytes(finished, tmp_path):
     message = error_of(made, tmp_path, 10, SPEC, PaintedPairMaker(dies_at=6))
     assert "found one killed" in message
-    assert message.endswith("all finished pairs are complete: rerun the same command to resume")
+    assert message.endswith("all finished pairs are complete; rerun the same command to resume")
     assert sorted(contents(tmp_path)) == ["pylon-000000-000003.tar", "set.json"]
     # One worker makes this set; two made the set that it is compared with.
     assert made(tmp_path) == 6
@@ -146,7 +146,7 @@ def test_a_full_disk_is_a_one_line_error_and_leaves_no_partial_file(tmp_path):
     full = start(tmp_path, out, first="resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))")
     message = full.communicate()[1].splitlines()[-1]
     assert "pylon-000000-000003.tar: expected a file that can be written, found file too large" in message
-    assert message.endswith("all finished pairs are complete: rerun the same command to resume")
+    assert message.endswith("all finished pairs are complete; rerun the same command to resume")
     assert sorted(contents(out)) == ["set.json"]
 
 
