@@ -1,4 +1,4 @@
-"""Augmentation of pairs: crop, scale, mirror, recolour, and erase patches."""
+"""Augmentation of pairs by cropping, scaling, mirroring, recolouring and erasing patches."""
 
 from dataclasses import replace
 
@@ -11,7 +11,11 @@ from stereoweave.stereo import Sample, StereoCamera
 
 
 def crop(sample: Sample, height: int, width: int, rng: np.random.Generator) -> Sample:
-    """Crop the sample at a random place without scaling. Raises StereoweaveError if it is too small."""
+    """Crop the sample at a random place without scaling it.
+
+    Raises:
+        StereoweaveError: The sample is smaller than the crop.
+    """
     rows, columns = sample.disparity_px.shape
     if rows < height or columns < width:
         raise StereoweaveError(
@@ -31,19 +35,19 @@ _LARGEST_OFFSET = 0.14
 def augment(
     sample: Sample, height: int, width: int, rng: np.random.Generator, offset_share: float = 0.0
 ) -> Sample:
-    """Crop and augment the sample; disparity is scaled and shifted accordingly.
+    """Crop and augment the sample; its disparity is scaled and shifted accordingly.
 
     Args:
         sample: The sample to augment.
         height: Height of the crop in px.
         width: Width of the crop in px.
-        rng: Source of all draws.
-        offset_share: Share of samples whose right crop is shifted to the right, by up to 14 % of the width.
-            Their disparity grows by the same amount, so textureless surfaces are not always far away.
+        rng: Random number generator.
+        offset_share: Share of samples whose right crop is shifted to the right by up to 14 % of the width.
+            This increases their disparity, so textureless surfaces are not always far away.
     """
     offset = rng.uniform(0, _LARGEST_OFFSET) if offset_share and rng.random() < offset_share else 0.0
     sample = crop_and_scale(sample, height, width, rng, offset)
-    # Without the right view's disparity a mirrored pair has no ground truth.
+    # Without the right view's disparity, a mirrored pair has no ground truth.
     if rng.random() < 0.5 and np.isfinite(sample.right_disparity_px).any():
         sample = mirror(sample)
     if rng.random() < 0.3:
@@ -57,14 +61,14 @@ def augment(
 def crop_and_scale(
     sample: Sample, height: int, width: int, rng: np.random.Generator, offset: float = 0.0
 ) -> Sample:
-    """Crop the sample at a random place and scale the crop to height x width; disparity scales with it.
+    """Crop the sample at a random place, and scale the crop and its disparity to height x width.
 
-    The right view's crop is shifted right by the share `offset` of its width, as far as the sample allows.
+    The right view's crop is shifted right by `offset`, a share of its width, as far as the sample allows.
     """
     rows, columns = sample.disparity_px.shape
     smallest = max(height / rows, width / columns)
     scale = max(smallest, float(np.exp(rng.uniform(np.log(0.75), np.log(1.4)))))
-    # Height and width are scaled slightly differently, as by cameras whose pixels are not square.
+    # Height and width are scaled slightly differently, as if pixels were not square.
     stretch = float(np.exp(rng.uniform(-0.1, 0.1)))
     scale_y = max(scale * stretch, height / rows)
     part_height, part_width = min(round(height / scale_y), rows), min(round(width / scale), columns)
@@ -104,9 +108,9 @@ def crop_and_scale(
 def crop_camera(
     camera: StereoCamera | None, start_px: int, top_px: int, scale_x: float = 1.0, scale_y: float = 1.0
 ) -> StereoCamera | None:
-    """Return the camera of a crop with this left column and top row, after scaling.
+    """Return the camera of a crop that starts at the given column and row, after scaling.
 
-    Its focal length is the horizontal one, which determines depth.
+    The focal length is scaled by `scale_x`, because the horizontal focal length determines depth.
     """
     return camera and replace(
         camera,
@@ -142,7 +146,7 @@ def flip_rows(sample: Sample) -> Sample:
 def recolour(
     left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"], rng: np.random.Generator
 ) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w 3"]]:
-    """Apply one colour change to both views, and a small separate one to each."""
+    """Apply a random colour change to both views, and a small separate change to each view."""
     order = rng.permutation(3) if rng.random() < 0.3 else np.arange(3)
     gain, gamma = rng.uniform(0.7, 1.3, 3) * rng.uniform(0.7, 1.3), rng.uniform(0.7, 1.4)
     tables = []

@@ -1,4 +1,4 @@
-"""Batches for training: how their pairs are chosen, cropped, collated and split."""
+"""Training batches: selection, cropping and collation of their pairs."""
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from stereoweave.stereo import Sample
 
 
 class Batches(Dataset[dict[str, torch.Tensor]]):
-    """The batch of every step, or one rank's share of it.
+    """Dataset of one batch per step, or of one rank's share of each batch.
 
     A micro-batch depends only on the seed, the step and its index in the step, not on the process that
     requests it or on the order of the requests.
@@ -37,16 +37,16 @@ class Batches(Dataset[dict[str, torch.Tensor]]):
         )
 
     def key(self, step: int, part: int) -> tuple[int, ...]:
-        """Return the seed of a micro-batch's random draws.
+        """Return the seed for all random numbers of a micro-batch.
 
-        Trailing zeros do not change a seed, so the first micro-batch has the draws of (seed, step), like a
-        whole step before there were micro-batches. The last number is even, because odd numbers seed the
-        order of pairs and sets.
+        Trailing zeros do not change a seed, so the first micro-batch has the same random numbers as
+        (seed, step), which was the seed of a whole step before micro-batches existed. The third number is 0
+        and the last one even, because other values seed the order of the pairs and the choice of sets.
         """
         return self.recipe.seed, step, 0, 2 * part
 
     def list_pairs(self, step: int) -> list[int]:
-        """Return the indices of a step's pairs. Every pair of a set is drawn once before any is repeated."""
+        """Return the indices of a step's pairs. The pairs of a set repeat only after all have been drawn."""
         first, end = step * self.recipe.batch, (step + 1) * self.recipe.batch
         while len(self._drawn) < end:
             self._draw(2 * len(self._drawn) + end)
@@ -57,7 +57,7 @@ class Batches(Dataset[dict[str, torch.Tensor]]):
         return [self.pairs.name(index) for index in self.list_pairs(step)]
 
     def _draw(self, places: int) -> None:
-        """Draw a set for each of the first `places` pairs, and count the earlier draws of that set."""
+        """Draw a set for each of the first `places` pairs, and count how often that set was drawn before."""
         self._drawn = self.mix.draw_sets(places, np.random.default_rng((self.recipe.seed, 0, 0, 1)))
         self._turns = np.zeros(places, np.int64)
         for which in range(len(self.mix.sets)):
@@ -72,7 +72,7 @@ class Batches(Dataset[dict[str, torch.Tensor]]):
         return [crop(sample, *size, rng) for sample in samples]
 
     def _index(self, which: int, turn: int) -> int:
-        """Return the index of the pair that draw number `turn`, counted from 0, takes from set `which`."""
+        """Return the index of the pair that set `which` supplies in turn `turn`, counted from 0."""
         one = self.mix.sets[which]
         epoch, place = divmod(turn, one.count)
         rng = np.random.default_rng((self.recipe.seed, epoch, 1 + which))
@@ -83,7 +83,7 @@ class Batches(Dataset[dict[str, torch.Tensor]]):
 class CaughtBatches(Dataset[dict[str, torch.Tensor] | StereoweaveError]):
     """Batches that return errors as values instead of raising them.
 
-    An error raised in the loader's process would arrive with PyTorch's traceback as its message.
+    If a loader process raised an error, PyTorch would replace the message with a traceback.
     """
 
     def __init__(self, batches: Batches) -> None:
@@ -101,7 +101,7 @@ def read_known(pairs: PairSource, index: int) -> Sample:
     sample = pairs[index]
     if not np.isfinite(sample.disparity_px).any():
         raise StereoweaveError(
-            f"{pairs.name(index)}: expected at least one pixel of known disparity, found none; "
+            f"{pairs.name(index)}: expected at least one pixel with known disparity, found none; "
             "remove the pair from the dataset"
         )
     return sample
@@ -110,9 +110,9 @@ def read_known(pairs: PairSource, index: int) -> Sample:
 def collate(samples: list[Sample]) -> dict[str, torch.Tensor]:
     """Collate samples into a batch, a dictionary of tensors.
 
-    Images are [B, 3, H, W] in 0..1. Maps are [2B, 1, H, W]: those of the left views, then the mirrored maps
-    of the right views. If every sample has a camera, the batch also has `focal_baseline_px_m` and `doffs_px`,
-    both [B, 1, 1, 1].
+    Images are [B, 3, H, W] in 0..1. Maps are [2B, 1, H, W]; the maps of the left views come first, then the
+    mirrored maps of the right views. If every sample has a camera, the batch also contains
+    `focal_baseline_px_m` and `doffs_px`, both [B, 1, 1, 1].
 
     Raises:
         StereoweaveError: The samples differ in size.
@@ -120,7 +120,7 @@ def collate(samples: list[Sample]) -> dict[str, torch.Tensor]:
     sizes = sorted({sample.left.shape[:2] for sample in samples})
     if len(sizes) > 1:
         raise StereoweaveError(
-            f"batch: expected pairs of one size, found {' and '.join(f'{w}x{h}' for h, w in sizes)}; "
+            f"batch: expected pairs of the same size, found {' and '.join(f'{w}x{h}' for h, w in sizes)}; "
             "crop them to the same crop_size"
         )
 
@@ -148,11 +148,11 @@ def collate(samples: list[Sample]) -> dict[str, torch.Tensor]:
 
 
 def split_batch(batch: dict[str, torch.Tensor], parts: int) -> list[dict[str, torch.Tensor]]:
-    """Split a collated batch into equal parts in the order of its pairs."""
+    """Split a collated batch into equal parts that keep the order of its pairs."""
     pairs = len(batch["left"])
 
     def part(values: torch.Tensor, which: int) -> torch.Tensor:
-        # Maps of the left views come before those of the right ones.
+        # The maps of the left views come before those of the right views.
         return torch.unflatten(values, 0, (len(values) // pairs, parts, -1))[:, which].flatten(0, 1)
 
     return [{name: part(values, which) for name, values in batch.items()} for which in range(parts)]

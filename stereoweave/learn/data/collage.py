@@ -1,4 +1,4 @@
-"""Endless training pairs: collages of flat, slanted and bent surfaces, painted into both views.
+"""Unlimited training pairs: collages of flat, slanted and bent surfaces, painted into both views.
 
 For accuracy on photographs, natural textures and a wide range of disparities matter more than realistic
 geometry. Disparity and occlusion are nevertheless exact in both views.
@@ -17,11 +17,11 @@ from stereoweave.learn.data.paint_kernels import Sheet, colour, cover, expose, f
 from stereoweave.learn.data.textures import LIGHT_MAPS, draw_natural_colour, make_light_map
 from stereoweave.stereo import Sample
 
-CLEAN_SHARE = 0.25  # of pairs, without any photometric difference
-FAULTY_SHARE = 0.03  # of pairs, with the faults of poor cameras
-NOISE_SHARE = 0.02  # of training pairs, which show nothing but noise
-SHIFTED_APART_SHARE = 0.04  # of training pairs, with partly negative disparities
-NOTHING_PX = -1000.0  # disparity of pixels without any match; stays below 0 under any shift of the views
+CLEAN_SHARE = 0.25  # share of pairs without photometric differences
+FAULTY_SHARE = 0.03  # share of pairs with the faults of poor cameras
+NOISE_SHARE = 0.02  # share of training pairs that show nothing but noise
+SHIFTED_APART_SHARE = 0.04  # share of training pairs with partly negative disparities
+NOTHING_PX = -1000.0  # disparity of pixels without a match; negative even after the views are shifted
 LEVELS = np.arange(1021, dtype=np.float32) / 4  # grey levels that a tone curve distinguishes
 
 
@@ -30,14 +30,14 @@ View = Float[np.ndarray, "h w 3"]  # 0..255
 
 @dataclass(frozen=True, kw_only=True)
 class PaintedView:
-    """One view: image float32 [H, W, 3] in 0..255, and its disparity float32 [H, W]."""
+    """Image of one view, float32 [H, W, 3] in 0..255, and its disparity, float32 [H, W]."""
 
     image: Float[np.ndarray, "h w 3"]
     disparity_px: Float[np.ndarray, "h w"]
 
 
 def paint_collage(seed: int, epoch: int, index: int, height: int = 256, width: int = 384) -> Sample:
-    """Paint the mixed collage with this index, with exact disparity and occlusion for both views.
+    """Paint the mixed collage with the given index, and its exact disparity and occlusion in both views.
 
     The same arguments give the same pair in every process. Disparities are finite and >= 0. The first call
     builds the textures, which takes a few seconds.
@@ -50,8 +50,8 @@ def paint_training_collage(seed: int, epoch: int, index: int, height: int = 256,
     """Paint a collage of any kind, in the format of `paint_collage`.
 
     6 % of the pairs train only the confidence. Some or all of their disparities are below 0, where a network
-    that clamps at 0 cannot find them. Either the crops of both views are shifted apart, with exact
-    disparities of both signs, or both views are plain noise, with NOTHING_PX as disparity.
+    that clamps at 0 cannot find them. Either the crops of the two views are shifted apart, which gives exact
+    disparities of both signs, or both views show plain noise, and every disparity is NOTHING_PX.
     """
     rng = np.random.default_rng((seed, epoch, index, 1))
     kind = rng.random()
@@ -69,7 +69,7 @@ def _paint_matchable(
     height: int,
     width: int,
 ) -> tuple[PaintedView, PaintedView]:
-    """Paint both views of random scenes until a scene has enough contrast and few enough occlusions."""
+    """Paint both views of random scenes until one has enough contrast and few enough occluded pixels."""
     while True:
         left, right = paint_scene(draw(rng, height, width))
         occluded, right_occluded = _find_occlusions(left, right)
@@ -102,7 +102,7 @@ def _make_sample(rng: np.random.Generator, left: PaintedView, right: PaintedView
 def _crop_apart(
     rng: np.random.Generator, left: PaintedView, right: PaintedView, width: int
 ) -> tuple[PaintedView, PaintedView]:
-    """Crop both views to `width`, the left one far enough to the right that many disparities are below 0."""
+    """Crop both views to `width`, the left view so far to the right that many disparities are below 0."""
     spare = left.image.shape[1] - width
     start = int(np.clip(np.ceil(np.quantile(left.disparity_px, rng.uniform(0.1, 0.7))), 1, spare))
 
@@ -138,7 +138,7 @@ def _paint_plain_noise(rng: np.random.Generator, height: int, width: int) -> Sam
 
 
 def paint_scene(scene: CollageScene) -> tuple[PaintedView, PaintedView]:
-    """Paint the left and right views of a scene, as ideal cameras see it."""
+    """Paint the left and right views of a scene as ideal cameras would see it."""
     left_sheets = [layer.sheet() for layer in scene.layers]
     right_sheets = [warp_to_right(sheet, scene.width) for sheet in left_sheets]
     return _paint_view(scene, left_sheets, 0), _paint_view(scene, right_sheets, 1)
@@ -158,8 +158,8 @@ def _paint_view(scene: CollageScene, sheets: list[Sheet], side: int) -> PaintedV
 def simulate_cameras(
     rng: np.random.Generator, left: Float[np.ndarray, "h w 3"], right: Float[np.ndarray, "h w 3"]
 ) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w 3"]]:
-    """Simulate two real cameras: slight differences in height, sharpness, tone and noise."""
-    # A separate generator: pairs without faults stay the same as before faults were introduced.
+    """Simulate two real cameras that differ slightly in height, sharpness, tone and noise."""
+    # A separate generator, so that pairs without faults stay the same as before faults were introduced.
     fault_rng = rng.spawn(1)[0]
     if fault_rng.random() < FAULTY_SHARE:
         left, right = _add_faults(fault_rng, left, right)
@@ -168,8 +168,8 @@ def simulate_cameras(
         return expose(left, plain, still, left), expose(right, plain, still, right)
     if rng.random() < 0.33:
         right = _shift_down(right, rng.uniform(-0.5, 0.5))
-    # One pair in six has clearly different exposures; in the others they differ as between two cameras of the
-    # same model.
+    # One pair in six has clearly different exposures. In the others, exposures differ as they do between two
+    # cameras of the same model.
     spread = 0.2 if rng.random() < 0.17 else 0.04
     noise_level = float(np.exp(rng.uniform(np.log(0.2), np.log(5)))) if rng.random() < 0.75 else 0.0
     blur_share = 0.5 if rng.random() < 0.4 else 0.0
@@ -198,12 +198,12 @@ def _add_faults(rng: np.random.Generator, left: View, right: View) -> tuple[View
 
 
 def _misalign_rows(rng: np.random.Generator, left: View, right: View) -> tuple[View, View]:
-    """Shift the right view up or down by one or two rows."""
+    """Shift the right view up or down by 0.8 to 2 rows."""
     return left, _shift_down(right, rng.choice([-1, 1]) * rng.uniform(0.8, 2))
 
 
 def _blur_one(rng: np.random.Generator, left: View, right: View) -> tuple[View, View]:
-    """Blur one of the views, like a defocused lens."""
+    """Blur one of the views as if its lens were out of focus."""
     deviation_px, which = rng.uniform(0.7, 1.6), rng.integers(2)
     if which:
         return left, cv2.GaussianBlur(right, (0, 0), deviation_px)
@@ -211,13 +211,13 @@ def _blur_one(rng: np.random.Generator, left: View, right: View) -> tuple[View, 
 
 
 def _darken_corners(rng: np.random.Generator, left: View, right: View) -> tuple[View, View]:
-    """Darken the corners of both views by different vignetting."""
+    """Darken the corners of both views by different amounts."""
     own, other = (_make_vignette(left.shape[0], left.shape[1], rng.uniform(0.2, 0.7)) for _ in range(2))
     return left * own, right * other
 
 
 def _interpolate_colours(rng: np.random.Generator, left: View, right: View) -> tuple[View, View]:
-    """Apply Bayer interpolation to one or both views."""
+    """Demosaic one or both views, as cameras with a Bayer filter do."""
     which = rng.integers(3)
     return left if which == 1 else demosaic(left), right if which == 2 else demosaic(right)
 

@@ -45,7 +45,7 @@ class CollageCanvas:
 
     @property
     def width(self) -> int:
-        """Number of columns of the left view and of the area to its right that only the right camera sees."""
+        """Number of columns, including those beyond the left view that only the right camera sees."""
         return self.view_width + int(np.ceil(self.limit_px)) + 2
 
     def whole(self) -> Placement:
@@ -53,16 +53,16 @@ class CollageCanvas:
         return Placement(self.width / 2, self.height / 2, self.width / 2, self.width, self.height)
 
     def place(self, x: float, y: float, radius_px: float) -> Placement:
-        """Return a placement at a point of the canvas."""
+        """Return a placement at a point on the canvas."""
         return Placement(x, y, radius_px, self.width, self.height)
 
     def anywhere(self, rng: np.random.Generator, smallest: float, largest: float) -> Placement:
-        """Draw a placement whose half extent is log-uniform between these shares of the width."""
+        """Draw a placement whose half extent is log-uniform between the given shares of the canvas width."""
         radius_px = self.width * float(np.exp(rng.uniform(np.log(smallest), np.log(largest))))
         return self.place(rng.uniform(0, self.width), rng.uniform(0, self.height), radius_px)
 
     def between(self, far_px: float, nearness: float) -> float:
-        """Return the disparity at a nearness of 0 (far_px) to 1 (the scene's largest disparity)."""
+        """Return the disparity for a nearness from 0 (`far_px`) to 1 (the scene's largest disparity)."""
         return far_px + (self.limit_px - far_px) * nearness
 
 
@@ -72,7 +72,8 @@ Kind = Callable[[np.random.Generator, CollageCanvas], list[CollageLayer]]
 def draw_scene(rng: np.random.Generator, height: int, width: int) -> CollageScene:
     """Draw a mixed scene, as used for validation.
 
-    Its largest disparity is log-uniform: mostly 10 to 110 px, sometimes 6 to 188 px, for views 384 px wide.
+    For views 384 px wide, its largest disparity is log-uniform, usually from 10 to 110 px and otherwise from
+    6 to 188 px.
     """
     low, high = (10, 110) if rng.random() < 0.7 else (6, 190)
     limit_px = float(np.exp(rng.uniform(np.log(low), np.log(high)))) * width / 384
@@ -82,8 +83,8 @@ def draw_scene(rng: np.random.Generator, height: int, width: int) -> CollageScen
 def draw_training_scene(rng: np.random.Generator, height: int, width: int) -> CollageScene:
     """Draw a scene of any kind, with a wider baseline than for validation.
 
-    Its largest disparity is log-uniform: mostly 22 to 175 px, sometimes 6 to 188 px. It is proportionally
-    smaller in views that are less than 384 px wide.
+    Its largest disparity is log-uniform, usually from 22 to 175 px and otherwise from 6 to 188 px. It is
+    proportionally smaller in views that are less than 384 px wide.
     """
     low, high = (22, 175) if rng.random() < 0.7 else (6, NETWORK_REACH_PX)
     # Wider views show more of a scene, not larger disparities, because the network's range is limited.
@@ -128,9 +129,9 @@ def _draw_floor(
     least_rise: float,
     paint: Callable[[np.random.Generator, Placement], Paint],
 ) -> CollageLayer:
-    """Draw a floor that starts at a horizon of disparity start_px.
+    """Draw a floor whose disparity is `start_px` at the horizon.
 
-    Its disparity rises towards the bottom by a random share of the remaining range.
+    Its disparity increases towards the bottom by a random share of the remaining range.
     """
     horizon, tilt = rng.uniform(0.3, 0.8) * canvas.height, rng.normal(0, 0.1)
     # The floor's disparity is constant along the horizon.
@@ -177,7 +178,7 @@ def _draw_plain_plane(rng: np.random.Generator, canvas: CollageCanvas, far_px: f
 def _draw_attached(
     rng: np.random.Generator, canvas: CollageCanvas, plain: CollageLayer
 ) -> list[CollageLayer]:
-    """Draw objects on the plane's surface, in half of the scenes."""
+    """Draw objects on the plane's surface in half of the scenes, and none in the others."""
     count = rng.integers(1, 4) if rng.random() < 0.5 else 0
     places = [canvas.anywhere(rng, 0.015, 0.1) for _ in range(count)]
     return [
@@ -205,7 +206,7 @@ def _draw_objects_before(
 
 
 def draw_street(rng: np.random.Generator, canvas: CollageCanvas) -> list[CollageLayer]:
-    """Draw a ground plane from the horizon to the camera, upright objects on it, and a sky."""
+    """Draw a ground plane that reaches from the horizon to the camera, upright objects on it, and a sky."""
     horizon = rng.uniform(0.3, 0.6) * canvas.height
     rise = rng.uniform(0.5, 1.0) * canvas.limit_px / (canvas.height - horizon)
     middle_x = rng.uniform(0.25, 0.6) * canvas.width
@@ -267,7 +268,7 @@ def _draw_markings(
 def _draw_upright(
     rng: np.random.Generator, canvas: CollageCanvas, ground: CollageSurface, nearness: float, tallness: float
 ) -> CollageLayer:
-    """Draw an upright object with the disparity of its foot; `tallness` is its height in camera heights."""
+    """Draw an upright object on the ground; `tallness` is its height in camera heights."""
     horizon = ground.plane[4]
     height = nearness * (canvas.height - horizon)
     foot_x, foot_y = rng.uniform(0, canvas.width), horizon + height
@@ -306,9 +307,9 @@ def _draw_facade(
 
 
 def draw_film(rng: np.random.Generator, canvas: CollageCanvas) -> list[CollageLayer]:
-    """Draw focused figures far in front of an unfocused background.
+    """Draw figures in focus, far in front of an out-of-focus background.
 
-    In a third of the scenes, an unfocused object is close to the camera.
+    In a third of the scenes, an out-of-focus object is close to the camera.
     """
     far_px = canvas.limit_px * rng.uniform(0.02, 0.25)
     layers = [_draw_unfocused(rng, canvas, _cover_canvas(canvas), canvas.whole(), far_px)]
@@ -332,7 +333,7 @@ def _draw_unfocused(
 
 
 def _draw_figure(rng: np.random.Generator, canvas: CollageCanvas, level_px: float) -> list[CollageLayer]:
-    """Draw a large object, mostly plain, with a few details on its surface."""
+    """Draw a large, usually plain object with a few details on its surface."""
     place = canvas.anywhere(rng, 0.12, 0.4)
     smooth = rng.random() < 0.6
     body = draw_layer(rng, draw_shape(rng, place), place, level_px, canvas.limit_px)

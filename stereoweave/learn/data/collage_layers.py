@@ -1,4 +1,4 @@
-"""Random surfaces and paints of a collage's layers."""
+"""Random surfaces and paints for the layers of a collage."""
 
 import cv2
 import numpy as np
@@ -37,7 +37,7 @@ def draw_layer(
 def draw_plane(
     rng: np.random.Generator, place: Placement, level_px: float, limit_px: float
 ) -> CollageSurface:
-    """Draw a plane with this disparity at its centre; one plane in five faces the camera."""
+    """Draw a plane with disparity `level_px` at its centre; one plane in five faces the camera."""
     slope = min(PLANE_SLOPE, RELIEF * limit_px / place.radius_px)
     flat = rng.random() < 0.2
     slope_x, slope_y = (0.0, 0.0) if flat else (slope * rng.triangular(-1, 0, 1, 2)).tolist()
@@ -47,7 +47,7 @@ def draw_plane(
 def draw_surface(
     rng: np.random.Generator, place: Placement, level_px: float, limit_px: float
 ) -> CollageSurface:
-    """Draw a surface, which is a plane in half of the layers and bent in the others."""
+    """Draw a surface that is planar in half of the layers and bent in the others."""
     plane = draw_plane(rng, place, level_px, limit_px).plane
     relief_px = RELIEF * limit_px
     waves, hills = [], []
@@ -61,7 +61,7 @@ def draw_surface(
             waves.append((amplitude, along_x, along_y, rng.uniform(0, 2 * np.pi)))
     elif bend < 0.5:
         radius_px = place.radius_px * rng.uniform(0.4, 1.2)
-        # The steepest slope of a Gaussian of this radius is 0.86 of its height over the radius.
+        # The steepest slope of a Gaussian is 0.86 times its height divided by its radius.
         height_px = min(BEND_SLOPE * radius_px / 0.86, relief_px) * rng.uniform(-0.4, 1)
         keep = [(1, 1), (1, 0), (0, 1)][rng.integers(3)]
         hills.append((height_px, place.x, place.y, keep[0] / radius_px, keep[1] / radius_px))
@@ -69,7 +69,7 @@ def draw_surface(
 
 
 def draw_paint(rng: np.random.Generator, place: Placement) -> Paint:
-    """Draw a lit texture of a random kind and colour, almost without contrast in a fifth of the layers."""
+    """Draw a lit texture of a random kind and colour; in a fifth of the layers it has almost no contrast."""
     texture, count = (
         (make_periodic, PERIODIC_TEXTURES) if rng.random() < 0.12 else (make_natural, NATURAL_TEXTURES)
     )
@@ -88,7 +88,7 @@ def draw_paint(rng: np.random.Generator, place: Placement) -> Paint:
 def draw_plain_paint(
     rng: np.random.Generator, place: Placement, colour: Float[np.ndarray, "3"] | None = None
 ) -> Paint:
-    """Draw a nearly plain paint: one colour, at most 3 % of a texture's contrast, and nearly even light."""
+    """Draw a nearly plain paint: one colour, at most 3 % of a texture's contrast, and almost even light."""
     paint = draw_paint(rng, place)
     contrast = rng.uniform(0, 0.03) if rng.random() < 0.7 else 0.0
     light = 1 + rng.uniform(0, 0.35) * (paint.light - 1)
@@ -106,7 +106,7 @@ def draw_unfocused_paint(rng: np.random.Generator, place: Placement) -> Paint:
 
 
 def _draw_mapping(rng: np.random.Generator, texels_per_px: float, side: int) -> Float[np.ndarray, "2 3"]:
-    # Most vertical structures are vertical in photographs too.
+    # In photographs, most vertical structures appear vertical.
     turn = rng.normal(0, 0.1) if rng.random() < 0.5 else rng.uniform(0, 2 * np.pi)
     cosine, sine = texels_per_px * np.cos(turn), texels_per_px * np.sin(turn)
     shift = rng.uniform(0, 2 * side, 2)
@@ -114,7 +114,7 @@ def _draw_mapping(rng: np.random.Generator, texels_per_px: float, side: int) -> 
 
 
 def _draw_recolouring(rng: np.random.Generator) -> Float[np.ndarray, "3 4"]:
-    """Draw a colour transform, which removes most contrast in a fifth of the layers."""
+    """Draw a colour transform that removes most of the contrast in a fifth of the layers."""
     if rng.random() < 0.2:
         return _reduce_contrast(rng.uniform(0.01, 0.08), draw_natural_colour(rng))
     gain = np.exp(rng.normal(0, 0.25) + rng.normal(0, 0.1, 3))
@@ -130,7 +130,7 @@ def _reduce_contrast(contrast: float, colour: Float[np.ndarray, "3"]) -> Float[n
 
 
 def _draw_gloss(rng: np.random.Generator, place: Placement) -> Float[np.ndarray, "6"]:
-    """Draw a highlight on a fifth of the layers; it shifts by up to 8 px on the surface in the right view."""
+    """Draw a highlight on a fifth of the layers; between the views it moves by up to 8 px on the surface."""
     if rng.random() < 0.8:
         return np.zeros(6, np.float32)
     x, y = rng.normal([place.x, place.y], place.radius_px / 2)

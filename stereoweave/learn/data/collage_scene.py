@@ -11,13 +11,14 @@ from stereoweave.learn.data.silhouettes import Patch
 
 @dataclass(frozen=True, kw_only=True)
 class CollageSurface:
-    """Disparity as a function of left-image x and y: a sum of plane, waves and hills in 0..limit_px.
+    """Disparity as a function of x and y in the left image: the sum of a plane, waves and hills.
 
     Attributes:
         plane: Disparity at the centre, its slopes along x and y, and the centre's x and y.
-        waves: Rows of amplitude_px, angular frequencies along x and y, and phase.
-        hills: Rows of height_px, centre x and y, inverse radii along x and y (0: a ridge, as on a cylinder).
-        limit_px: Largest disparity of the scene.
+        waves: Amplitude in px, angular frequencies along x and y, and phase of each wave.
+        hills: Height in px, centre x and y, and inverse radii along x and y of each hill. An inverse radius
+            of 0 gives a ridge, as on a cylinder.
+        limit_px: Largest disparity of the scene; the sum is clamped to 0..limit_px.
     """
 
     plane: tuple[float, float, float, float, float]
@@ -31,7 +32,7 @@ class CollageSurface:
         return min(max(level + slope_x * (x - centre_x) + slope_y * (y - centre_y), 0.0), self.limit_px)
 
     def over(self, patch: Patch) -> Float[np.ndarray, "h w"]:
-        """Return the disparity at each pixel of the patch, float32."""
+        """Return the disparity at each pixel of the patch as float32."""
         x = np.arange(patch.field.shape[1], dtype=np.float32) + patch.left
         y = np.arange(patch.field.shape[0], dtype=np.float32) + patch.top
         level, slope_x, slope_y, centre_x, centre_y = self.plane
@@ -63,7 +64,7 @@ class CollageLayer:
 
 @dataclass(frozen=True, kw_only=True)
 class CollageScene:
-    """Layers from far to near (by their centres), and the size of the views in px."""
+    """Layers sorted from far to near by their centres, and the size of the views in px."""
 
     layers: tuple[CollageLayer, ...]
     height: int

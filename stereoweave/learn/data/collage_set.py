@@ -1,4 +1,4 @@
-"""Collages as a set on disk, in the same shards as rendered sets, for `stereoweave bench pairs`."""
+"""Collages on disk, in the same shard format as rendered sets, for `stereoweave bench pairs`."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,13 +16,13 @@ _PAIRS_A_SHARD = 50
 
 
 def write_collages(out: Path, pairs: int, seed: int, size_px: tuple[int, int]) -> None:
-    """Write `pairs` collages as shards: the first ones of epoch 0 with the given seed.
+    """Write the first `pairs` collages of epoch 0 as shards.
 
     Args:
-        out: The folder, new or empty.
+        out: New or empty folder.
         pairs: Number of pairs.
-        seed: Seed of the collages; `sources.VALIDATION_SEED` gives the pairs that trainings validate on.
-        size_px: Height and width.
+        seed: Seed of the collages; `sources.VALIDATION_SEED` gives the pairs for validation.
+        size_px: Height and width in pixels.
 
     Raises:
         StereoweaveError: A side is too small, or the folder is not empty or not writable.
@@ -37,7 +37,7 @@ def write_collages(out: Path, pairs: int, seed: int, size_px: tuple[int, int]) -
     with lock_output(out):
         if any(out.glob("[!.]*")):
             raise StereoweaveError(
-                f"{out}: expected a new or empty folder, found files in it; give another one"
+                f"{out}: expected a new or empty folder, found files in it; choose another folder"
             )
         for first in range(0, pairs, _PAIRS_A_SHARD):
             numbers = range(first, min(first + _PAIRS_A_SHARD, pairs))

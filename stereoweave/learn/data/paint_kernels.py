@@ -1,7 +1,7 @@
-"""Kernels that paint collages: distance fields of silhouettes, blending of layers, occlusion.
+"""Kernels that paint collages: distance fields of silhouettes, blending of layers, and occlusion.
 
-A layer is defined over left-image columns and rows, as a `Sheet`. Its disparity is linear between columns,
-so warping to the right view is exact.
+A layer is defined over the columns and rows of the left image, as a `Sheet`. Its disparity is linear between
+columns, so warping to the right view is exact.
 """
 
 import math
@@ -19,10 +19,10 @@ class Sheet(NamedTuple):
     """A layer as seen in one view, starting at column `left` and row `top`.
 
     Attributes:
-        field: Float32 [h, w], signed distance in px to the silhouette, positive inside, clamped to
-            +-REACH_PX. Coverage of a pixel is field + 0.5, clamped to 0..1; disparity is defined where the
-            field is >= 0.
-        disparity_px: Float32 [h, w].
+        field: Signed distance in px to the silhouette, float32 [h, w], positive inside and clamped to
+            +-REACH_PX. The coverage of a pixel is field + 0.5, clamped to 0..1. The disparity is defined
+            where the field is >= 0.
+        disparity_px: Disparity of each pixel, float32 [h, w].
     """
 
     field: Float[np.ndarray, "h w"]
@@ -32,15 +32,16 @@ class Sheet(NamedTuple):
 
 
 class Paint(NamedTuple):
-    """A layer's appearance. Coordinates x, y are of the left image; all arrays but the texture are float32.
+    """Appearance of a layer. x and y are left-image coordinates; all arrays except the texture are float32.
 
     Attributes:
-        texture: uint8 RGB, tiled by mirroring.
-        to_texture: Mapping of x, y, 1 to texels.
-        to_colour: Mapping of a texel's r, g, b, 1 to the layer's colour.
-        light: Factor of the colour, tiled by mirroring.
-        to_light: Mapping of x, y, 1 to places in the light map.
-        gloss: A highlight's centre x, y, inverse radii along x, y, strength, and shift in the right view.
+        texture: Texels in uint8 RGB, tiled by mirroring.
+        to_texture: Affine mapping from x, y, 1 to texel coordinates.
+        to_colour: Affine mapping from a texel's r, g, b, 1 to the layer's colour.
+        light: Light map, whose values multiply the colour, tiled by mirroring.
+        to_light: Affine mapping from x, y, 1 to coordinates in the light map.
+        gloss: A highlight's centre x and y, inverse radii along x and y, strength, and shift in the right
+            view.
     """
 
     texture: UInt8[np.ndarray, "_ _ 3"]
@@ -68,7 +69,7 @@ def draw_outline_field(
 def draw_stroke_field(
     strokes: tuple[tuple[Float[np.ndarray, "_ 2"], float], ...], left: int, top: int, shape: tuple[int, int]
 ) -> Float[np.ndarray, "h w"]:
-    """Return the signed distance in px, float32, to polylines (x, y), each with its half width in px."""
+    """Return the signed distance in px, float32, to polylines (x, y), each with its own half width."""
     field = np.full(shape, -REACH_PX, np.float32)
     for points, half_width_px in strokes:
         _stroke(field, points - (left, top), half_width_px)
@@ -78,7 +79,7 @@ def draw_stroke_field(
 def sum_surface(
     columns: Float[np.ndarray, "k w"], rows: Float[np.ndarray, "k h"], limit_px: float
 ) -> Float[np.ndarray, "h w"]:
-    """Return the disparity, float32: the sum of rows[k, y] * columns[k, x], clamped to 0..limit_px."""
+    """Return the float32 disparity, the sum over k of rows[k, y] * columns[k, x] clamped to 0..limit_px."""
     return _sum_surface(columns, rows, limit_px)
 
 
@@ -106,8 +107,8 @@ def colour(
 ) -> None:
     """Blend the sheet's colours into the float32 image (0..255) where no opaque sheet is nearer.
 
-    `side` is 0 in the left view and 1 in the right one: column x shows column x + side * disparity_px of the
-    left image.
+    `side` is 0 for the left view and 1 for the right view. Column x of the view shows column
+    x + side * disparity_px of the left image.
     """
     _colour(image, sheet, paint, nearest_opaque, side)
 
@@ -131,10 +132,10 @@ def expose(
     deviation: Float[np.ndarray, "3 1021"],
     noise: Float[np.ndarray, "h w 3"],
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Apply a tone curve per channel to the image, add noise, and round.
+    """Apply a tone curve to each channel of the image, add noise, and round.
 
     Args:
-        image: float32, 0..255.
+        image: Image in float32, 0..255.
         tone: Output grey level, with four entries per input grey level.
         deviation: Standard deviation of the noise, in the same format.
         noise: Standard normal values.
@@ -229,7 +230,7 @@ def _warp_to_right(field, disparity, left, width):
             for column in range(first, min(stop, int(math.ceil(far)))):
                 t = (column - near) / (far - near)
                 field_right[y, column - start] = field[y, x] + t * (field[y, x + 1] - field[y, x])
-                # The column in the left image is exact; the disparity is the difference of both columns.
+                # The left-image column is exact; the disparity is the difference between the columns.
                 disparity_right[y, column - start] = left + x + t - column
     return field_right, disparity_right, start
 
@@ -251,7 +252,7 @@ def _cover(sheet, nearest, nearest_opaque):
 @njit(cache=True, nogil=True)
 @typing.no_type_check
 def _fold(position, last):
-    # Mirrored tiling: forwards and backwards over 0..last.
+    # Mirrored tiling runs forwards and backwards over 0..last.
     position -= np.float32(2 * last) * np.floor(position * np.float32(0.5 / last))
     position = np.float32(last) - abs(position - np.float32(last))
     index = min(int(position), last - 1)
@@ -261,7 +262,7 @@ def _fold(position, last):
 @njit(cache=True, nogil=True)
 @typing.no_type_check
 def _place(mapping, x, y, map_height, map_width):
-    # Returns column, row, and the fractions towards the next column and row.
+    # Returns the column, the row, and the fractions towards the next column and row.
     u, across = _fold(mapping[0, 0] * x + mapping[0, 1] * y + mapping[0, 2], map_width - 1)
     v, down = _fold(mapping[1, 0] * x + mapping[1, 1] * y + mapping[1, 2], map_height - 1)
     return u, v, across, down
@@ -299,7 +300,7 @@ def _shine(gloss, x, y, side):
 @njit(cache=True, nogil=True)
 @typing.no_type_check
 def _colour(image, sheet, paint, nearest_opaque, side):
-    # Single precision throughout: twice as fast.
+    # Single precision throughout, because it is twice as fast.
     field, disparity, left, top = sheet
     texture, to_texture, mix, light, to_light, gloss = paint
     side = np.float32(side)
@@ -324,8 +325,8 @@ def _colour(image, sheet, paint, nearest_opaque, side):
 @njit(cache=True, nogil=True)
 @typing.no_type_check
 def _find_occluded(disparity, other, sign):
-    # Half a pixel of tolerance for rounding and for surfaces that nearly touch. On a slope, one of the two
-    # columns beside the match is never nearer than the surface itself, so a slope does not occlude itself.
+    # The tolerance is half a pixel, for rounding and for surfaces that nearly touch. On a slope, one of the
+    # two columns beside the match is never nearer than the surface, so a slope does not occlude itself.
     height, width = disparity.shape
     occluded = np.empty((height, width), np.bool_)
     for y in range(height):

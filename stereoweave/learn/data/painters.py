@@ -1,7 +1,7 @@
 """Worker processes that paint and crop batches during training and pass them through shared memory.
 
-Each process has two slots for batches and a pipe, but no lock that a killed process could leave held. The end
-of a process is noticed at once.
+Each process has two slots for batches and a pipe, but no lock that a killed process could leave held. A
+process that exits is noticed immediately.
 """
 
 import multiprocessing
@@ -31,10 +31,10 @@ from stereoweave.stereo import Sample
 _SLOTS = 2  # per process: one is filled while the other waits to be taken
 # Compiling kernels and building textures takes a minute on a slow machine.
 _PATIENCE_S = 180.0
-# Pairs that a process keeps in memory to crop them again.
+# Number of pairs that a process keeps in memory to crop again.
 _HELD = 96
 _MOST_CUTS = 4.0
-# Added to the seed for the cool-down, whose batches have the same numbers but need other pairs.
+# Added to the seed in the cool-down, whose batches have the same numbers but need different pairs.
 _OTHER_SEED = 1000
 
 
@@ -48,7 +48,7 @@ class BatchRequest(NamedTuple):
 
 
 class PainterShare(NamedTuple):
-    """One process's share: recipes, folder of the held-out pairs, its index, and the number of processes."""
+    """One process's share: recipes, folder of the held-out pairs, process index, and number of processes."""
 
     recipes: tuple[Recipe, ...]
     folder: Path
@@ -57,7 +57,7 @@ class PainterShare(NamedTuple):
 
 
 class PaintedBatch(NamedTuple):
-    """A finished batch; `problem` is the traceback if the batch failed."""
+    """A finished batch; `problem` holds the traceback if the batch failed and is empty otherwise."""
 
     request: BatchRequest
     problem: str = ""
@@ -72,7 +72,7 @@ class TensorPlace(NamedTuple):
 
 
 class ReusedPairs:
-    """A source that returns each pair `cuts` times on average, since painting takes longer than cropping."""
+    """Source that returns each pair `cuts` times on average, because painting takes longer than cropping."""
 
     def __init__(self, pairs: PairSource, held: int = _HELD) -> None:
         self.pairs, self.cuts = pairs, 1.0
@@ -91,14 +91,14 @@ class ReusedPairs:
 
 
 class Painters:
-    """Processes that make a recipe's batches; leaving the context ends them.
+    """Processes that make a recipe's batches; they are stopped when the context exits.
 
     Args:
         recipes: Recipes of the batches; `switch` selects one.
         folder: Folder of the held-out pairs.
         processes: Number of processes.
-        first: Number of the first batch. Each number has its own pairs if the recipe paints fresh ones.
-        pinned: Copy batches to pinned memory, which a GPU can read directly.
+        first: Number of the first batch. If the recipe paints fresh pairs, each number has its own pairs.
+        pinned: Whether to copy batches to pinned memory, which a GPU can read directly.
 
     Attributes:
         cuts: How often each new pair is cropped; 1 while painting keeps up with training.
@@ -150,7 +150,7 @@ class Painters:
         self.recipe = recipe
 
     def adapt(self, late_share: float) -> None:
-        """Crop each pair more often if batches came late, less often if none did."""
+        """Crop each pair more often if over 10 % of the batches were late, and less often if none were."""
         if late_share > 0.1:
             self.cuts = min(self.cuts * 1.5, _MOST_CUTS)
         elif late_share == 0:
@@ -160,7 +160,7 @@ class Painters:
         """Take the next finished batch, in the format of `collate` but with uint8 images.
 
         Raises:
-            StereoweaveError: All processes have ended, too many batches failed, or none arrived in 3 minutes.
+            StereoweaveError: All processes have exited, too many batches failed, or none arrived in time.
         """
         self._collect(0)
         self.late += not self._ready
@@ -184,12 +184,12 @@ class Painters:
         if len(self.failures) > 5 + self.taken // 20:
             raise StereoweaveError(
                 f"{len(self.failures)} of {len(self.failures) + self.taken} batches failed; "
-                f"the last failure: {done.problem}"
+                f"the last of them failed with {done.problem}"
             )
         self._request(here, done.request.slot)
 
     def _collect(self, patience_s: float) -> None:
-        """Collect finished batches; drop processes that have ended."""
+        """Collect finished batches, and drop processes that have exited."""
         heard = wait(list(self._memory), patience_s)
         if patience_s and not heard:
             raise StereoweaveError(f"no batch arrived for {patience_s:.0f} s; use fewer processes")
@@ -204,13 +204,15 @@ class Painters:
         del self._memory[here]
         self._ready = deque(entry for entry in self._ready if entry[0] is not here)
         if not self._memory:
-            raise StereoweaveError("every process that makes batches has ended; check for lack of memory")
+            raise StereoweaveError(
+                "every process that makes batches has exited; check whether memory ran out"
+            )
 
     def _request(self, here: Connection, slot: int) -> None:
         try:
             here.send(BatchRequest(slot, self.number, self.recipe, self.cuts))
         except OSError:
-            return  # the process has ended, as the next `_collect` will notice
+            return  # the process has exited, which the next `_collect` will notice
         self.number += 1
 
     def _views(self, here: Connection, request: BatchRequest) -> dict[str, torch.Tensor]:
@@ -290,9 +292,9 @@ def _compute_layout(recipe: Recipe) -> tuple[dict[str, TensorPlace], int]:
 
 
 def make_cool_down_recipe(recipe: Recipe, crop_size: tuple[int, int]) -> Recipe:
-    """Return the recipe with crops of another size, cut from other pairs.
+    """Return the recipe with a different crop size and different pairs.
 
-    Pairs keep their margins around the crops, and a batch keeps about the same number of pixels.
+    The pairs keep their margins around the crops, and a batch keeps approximately its number of pixels.
     """
     margins = [pair - crop for pair, crop in zip(recipe.pair_size, recipe.crop_size, strict=True)]
     pair_size = (crop_size[0] + margins[0], crop_size[1] + margins[1])

@@ -16,7 +16,8 @@ from stereoweave.io.output_lock import lock_output
 from stereoweave.learn.data.collage import paint_collage as make_sample
 from stereoweave.stereo import Sample
 
-# Disparity is stored as 16-bit fixed point in KITTI's 1/256 px: half the size of float32, and precise enough.
+# Disparity is stored as 16-bit fixed point in KITTI's 1/256 px, which is precise enough and takes half the
+# memory of float32.
 _DISPARITY_SCALE = 256
 # A collage has no camera.
 _MAPS = [field.name for field in fields(Sample) if field.name != "camera"]
@@ -29,21 +30,21 @@ _SOURCES = (
 
 
 class CachedPairs:
-    """The first `count` collage pairs of a seed's epoch 0, cached in a subfolder of `folder`."""
+    """The first `count` collage pairs of epoch 0 with the given seed, cached in a subfolder of `folder`."""
 
     def __init__(self, folder: Path, seed: int, count: int, size: tuple[int, int]) -> None:
         self.folder = folder / f"seed{seed}-{size[0]}x{size[1]}-{generator_version()}"
         self.seed, self.count, self.size = seed, count, size
 
     def missing(self) -> list[int]:
-        """Return the indices of the pairs that are not cached yet."""
+        """Return the indices of the pairs that are not yet cached."""
         return [i for i in range(self.count) if not self._file(i).exists()]
 
     def make(self, console: Console) -> Iterable[int]:
-        """Make the missing pairs in parallel. Yields the index of each when it is done.
+        """Make the missing pairs in parallel. Yields the index of each finished pair.
 
-        Trainings with the same folder share their pairs; the second one prints a note and waits for the
-        first.
+        Trainings with the same folder share their pairs. The second training prints a note and waits for the
+        first one.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         note = f"{self.folder}: another training is making these pairs; waiting for it"

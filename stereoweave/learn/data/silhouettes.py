@@ -1,4 +1,4 @@
-"""Silhouettes of a collage's layers: patches of signed distances in left-image columns and rows."""
+"""Silhouettes of the layers in a collage, as patches of signed distances in the left image."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -38,12 +38,12 @@ class Placement:
     height: int
 
     def ring(self, angles: Float[np.ndarray, " n"], radii: Float[np.ndarray, " n"]) -> Points:
-        """Return the points at these angles and these multiples of the half extent."""
+        """Return the points at the given angles and at the given multiples of the half extent."""
         reach = self.radius_px * radii
         return np.stack([self.x + reach * np.cos(angles), self.y + reach * np.sin(angles)], axis=1)
 
     def box(self, points: Points, margin_px: float) -> tuple[int, int, tuple[int, int]]:
-        """Return left, top and (height, width) of the points' bounding box on the canvas; may be empty."""
+        """Return the points' bounding box on the canvas as left, top and (height, width); it may be empty."""
         canvas = [self.width, self.height]
         low = np.clip(np.floor(points.min(axis=0) - margin_px), 0, canvas).astype(int)
         high = np.clip(np.ceil(points.max(axis=0) + margin_px) + 1, low, canvas).astype(int)
@@ -62,7 +62,7 @@ def cover_canvas(width: int, height: int) -> Patch:
 
 
 def cover_below(line_y: float, tilt: float, width: int, height: int) -> Patch:
-    """Return a patch that covers the canvas below a line; the line starts at row line_y at the left edge."""
+    """Return a patch that covers the canvas below a line, which starts at row `line_y` at the left edge."""
     distance = np.arange(height)[:, None] - (line_y + tilt * np.arange(width)[None])
     return Patch(np.clip(distance, -REACH_PX, REACH_PX).astype(np.float32), 0, 0)
 
@@ -85,7 +85,7 @@ def draw_rods(rng: np.random.Generator, place: Placement) -> Patch:
 
 
 def draw_board(rng: np.random.Generator, place: Placement) -> Patch:
-    """Draw a rectangle in perspective, mostly upright, with the placement's half extent as half width."""
+    """Draw a rectangle in perspective, usually upright, with the placement's half extent as half width."""
     turn = rng.normal(0, 0.06) if rng.random() < 0.8 else rng.uniform(0, np.pi)
     half_height = rng.uniform(0.4, 1.1)
     corners = np.array([[-1, -half_height], [1, -half_height], [1, half_height], [-1, half_height]])
@@ -96,7 +96,7 @@ def draw_board(rng: np.random.Generator, place: Placement) -> Patch:
 
 
 def draw_pillar(rng: np.random.Generator, place: Placement) -> Patch:
-    """Draw a bar across the canvas, mostly upright, with the placement's half extent as half width."""
+    """Draw a bar across the canvas, usually upright, with the placement's half extent as half width."""
     turn = np.pi / 2 + rng.normal(0, 0.05) if rng.random() < 0.8 else rng.uniform(0, np.pi)
     reach = np.hypot(place.width, place.height) + place.radius_px
     along = reach * np.array([np.cos(turn), np.sin(turn)])
@@ -106,7 +106,7 @@ def draw_pillar(rng: np.random.Generator, place: Placement) -> Patch:
 
 
 def draw_post(place: Placement, half_width_px: float, foot_y: float) -> Patch:
-    """Draw an upright stroke from the placement's top down to foot_y."""
+    """Draw an upright stroke from the placement's top down to row `foot_y`."""
     points = np.array([[place.x, place.y - place.radius_px], [place.x, foot_y]])
     return _fill_strokes(((points, half_width_px),), place)
 

@@ -17,7 +17,7 @@ from stereoweave.learn.recipe import COLLAGE, Recipe
 from stereoweave.stereo import Sample
 from stereoweave.system.progress import progress
 
-# Seed of validation pairs; recipes' own seeds are small.
+# Seed of validation pairs; the seeds of recipes are small.
 VALIDATION_SEED = 1_000_003
 
 
@@ -31,7 +31,7 @@ class PairSource(Protocol):
     def __getitem__(self, index: int) -> Sample: ...
 
     def name(self, index: int) -> str:
-        """Return the name of the sample in error messages."""
+        """Return the sample's name for error messages."""
         ...
 
 
@@ -46,7 +46,7 @@ class OrderedSource(Protocol):
 
 @dataclass(frozen=True)
 class MixedSource:
-    """Sets concatenated as one source, and the weights by which training draws from them."""
+    """Sets concatenated into one source, and the weights with which training draws from each set."""
 
     sets: tuple[PairSource, ...]
     weights: tuple[float, ...]
@@ -64,11 +64,14 @@ class MixedSource:
         return source.name(place)
 
     def first_index(self, which: int) -> int:
-        """Return the index of the first pair of a set."""
+        """Return the index of the first pair in set `which`."""
         return sum(one.count for one in self.sets[:which])
 
     def draw_sets(self, places: int, rng: np.random.Generator) -> Int[np.ndarray, " n"]:
-        """Draw a set for each place by weight; with the same seed, longer draws begin with shorter ones."""
+        """Draw a set for each place by weight.
+
+        With the same seed, a longer sequence begins with the shorter one.
+        """
         bounds = np.cumsum(self.weights) / np.sum(self.weights)
         return np.searchsorted(bounds[:-1], rng.random(places), side="right")
 
@@ -101,7 +104,7 @@ class FreshCollages:
 
 @dataclass(frozen=True)
 class RenderedSet:
-    """A rendered set with simulated camera imperfections, which are the same whenever a pair is read."""
+    """Rendered set with simulated camera imperfections, which are the same each time that a pair is read."""
 
     shards: Shards
 
@@ -111,7 +114,7 @@ class RenderedSet:
 
     def __getitem__(self, index: int) -> Sample:
         sample = self.shards[index]
-        # As for collages, because matching is too easy without noise, blur and tone differences.
+        # As for collages, matching would be too easy without noise, blur and tone differences.
         left, right = collage.simulate_cameras(
             np.random.default_rng(index), sample.left.astype(np.float32), sample.right.astype(np.float32)
         )
@@ -144,7 +147,7 @@ class DatasetFrames:
 def open_sources(recipe: Recipe, folder: Path, whole: bool = False) -> tuple[PairSource, PairSource]:
     """Open a recipe's training and held-out pairs; collages are cached in folders below `folder`.
 
-    If `whole`, all held-out frames of a dataset are used, otherwise `validation_pairs` evenly spread ones.
+    If `whole`, all held-out frames of a dataset are used; otherwise, `validation_pairs` evenly spread frames.
     """
     if recipe.dataset == COLLAGE:
         collages = _open_collages(recipe, folder)
@@ -154,7 +157,7 @@ def open_sources(recipe: Recipe, folder: Path, whole: bool = False) -> tuple[Pai
         )
     if recipe.dataset not in DATASETS:
         raise FormatError(
-            f"{recipe.name}: dataset = {recipe.dataset!r}, expected {COLLAGE} or {', '.join(DATASETS)}"
+            f"{recipe.name}: dataset = {recipe.dataset!r}, expected one of {COLLAGE}, {', '.join(DATASETS)}"
         )
     frames = open_dataset(recipe.dataset, recipe.root)
     training, held_out = split_frames(frames, recipe.dataset, recipe.split)
@@ -181,7 +184,7 @@ def _mix_sets(recipe: Recipe, collages: PairSource) -> MixedSource:
 
 
 def open_held_out_sets(recipe: Recipe) -> dict[str, PairSource]:
-    """Open a recipe's further validation sets, keyed by name. Raises FormatError if one is missing."""
+    """Open a recipe's additional validation sets, keyed by name. Raises FormatError if one is missing."""
     sets: dict[str, PairSource] = {}
     for name, folder in recipe.held_out:
         found = tuple(
@@ -192,18 +195,18 @@ def open_held_out_sets(recipe: Recipe) -> dict[str, PairSource]:
 
 
 def _find_set_folders(recipe: Recipe, key: str, folder: Path) -> list[Path]:
-    """Return the folder if it is a rendered set, else the sets in it. Raises FormatError if there is none."""
+    """Return the rendered sets among the folder and its subfolders. Raises FormatError if there are none."""
     folders = [path for path in (folder, *sorted(folder.glob("*/"))) if list_shards(path)]
     if not folders:
         raise FormatError(
-            f"{recipe.name}: {key}: {folder}: expected pairs of `stereoweave synth make`, or folders of "
-            "such pairs, found none; render them first"
+            f"{recipe.name}: {key}: {folder}: expected pairs made by `stereoweave synth make` or "
+            "folders of such pairs, found none; render them first"
         )
     return folders
 
 
 def _open_rendered_sets(recipe: Recipe, folder: Path) -> list[PairSource]:
-    """Open the rendered sets of a folder. Raises FormatError if there are none, or pairs are too small."""
+    """Open the rendered sets in a folder. Raises FormatError if there are none or a pair is too small."""
     folders = _find_set_folders(recipe, "mix", folder)
     sets: list[PairSource] = [RenderedSet(Shards(path)) for path in folders]
     for path, one in zip(folders, sets, strict=True):
@@ -217,7 +220,7 @@ def _open_rendered_sets(recipe: Recipe, folder: Path) -> list[PairSource]:
 
 
 def cache_pairs(pairs: PairSource, console: Console) -> PairSource:
-    """Make the missing collages of a source and return the source."""
+    """Make the missing collages of a source, and return the source."""
     if isinstance(pairs, MixedSource):
         for one in pairs.sets:
             cache_pairs(one, console)

@@ -46,29 +46,35 @@ PHOTOGRAPHS = {
 
 @functools.cache
 def make_natural(k: int) -> Texture:
-    """Return natural texture k of 0..NATURAL_TEXTURES - 1, made on first use; the same in every process."""
+    """Return natural texture `k`, from 0 to NATURAL_TEXTURES - 1.
+
+    Each texture is made on first use and is the same in every process.
+    """
     return crop_photograph(k) if k < PHOTOGRAPH_CROPS else make_procedural(NATURAL, k - PHOTOGRAPH_CROPS)
 
 
 @functools.cache
 def make_periodic(k: int) -> Texture:
-    """Return periodic texture k of 0..PERIODIC_TEXTURES - 1, made on first use; the same in every process."""
+    """Return periodic texture `k`, from 0 to PERIODIC_TEXTURES - 1.
+
+    Each texture is made on first use and is the same in every process.
+    """
     return make_procedural(PERIODIC, k)
 
 
 def crop_photograph(k: int) -> Texture:
-    """Make crop k, a part of a photograph that is turned, mirrored, scaled and recoloured."""
+    """Make crop `k`, a part of a photograph, randomly rotated, mirrored, scaled and recoloured."""
     rng = np.random.default_rng((BANK_SEED, 1, k))
     weights = np.array(list(PHOTOGRAPHS.values()), float)
     photograph = _load_photograph(str(rng.choice(list(PHOTOGRAPHS), p=weights / weights.sum())))
     crop = _crop_turned(rng, photograph)
-    # A grey photograph gets a tint; the colours of others shift slightly.
+    # A grey photograph gets a tint; the colours of other photographs shift slightly.
     grey = np.ptp(crop, axis=2).max() < 3
     return _recolour(rng, crop.astype(np.float32), tint=0.16 if grey else 0.08)
 
 
 def make_procedural(kinds: dict[str, Procedure], k: int) -> Texture:
-    """Make procedural texture k; consecutive textures cycle through the kinds."""
+    """Make procedural texture `k`; consecutive textures cycle through the kinds."""
     rng = np.random.default_rng((BANK_SEED, 2, k))
     image = kinds[list(kinds)[k % len(kinds)]](rng)
     # Photographs have detail at the scale of a pixel.
@@ -77,9 +83,9 @@ def make_procedural(kinds: dict[str, Procedure], k: int) -> Texture:
 
 
 def draw_power_noise(rng: np.random.Generator, exponent: float, side: int = SIDE) -> Pattern:
-    """Draw noise of mean 0 and standard deviation 1 whose amplitude falls as frequency**-exponent.
+    """Draw noise with mean 0 and standard deviation 1, whose amplitude falls as frequency**-exponent.
 
-    The exponent is about 1 in photographs.
+    In photographs, the exponent is about 1.
     """
     frequency = np.hypot(np.fft.fftfreq(side)[:, None], np.fft.rfftfreq(side)[None])
     frequency[0, 0] = 1
@@ -90,7 +96,7 @@ def draw_power_noise(rng: np.random.Generator, exponent: float, side: int = SIDE
 
 
 def draw_natural_colour(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
-    """Draw a colour typical of surfaces, RGB 0..255: mostly muted, of any hue, rarely black or white."""
+    """Draw an RGB colour in 0..255 that is typical of real surfaces: any hue, but usually muted."""
     hue, saturation, value = rng.random() * 360, rng.beta(1.2, 3.6), 0.1 + 0.85 * rng.beta(2.0, 1.7)
     hsv = np.array([[[hue, saturation, value]]], np.float32)
     return cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)[0, 0] * 255
@@ -98,7 +104,7 @@ def draw_natural_colour(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
 
 @functools.cache
 def make_light_map(k: int) -> Float[np.ndarray, "64 64"]:
-    """Return light map k, float32 [64, 64] around 1; half of the maps have a soft-edged shadow."""
+    """Return light map `k`, float32 [64, 64] with values around 1; half of the maps have a soft shadow."""
     rng = np.random.default_rng((BANK_SEED, 3, k))
     light = 1 + rng.uniform(0.05, 0.2) * draw_power_noise(rng, 2.5, 64)
     if rng.random() < 0.5:
@@ -119,10 +125,10 @@ def _load_photograph(name: str) -> Photograph:
 
 def _crop_turned(rng: np.random.Generator, photograph: Photograph) -> Texture:
     height, width = photograph.shape[:2]
-    # Most of the picture, with little upsampling: blur is not a texture.
+    # The crop covers most of the picture and is hardly upsampled, because blur is not a texture.
     span = max(min(height, width) * rng.uniform(0.7, 1.0), 0.8 * SIDE)
     angle = rng.uniform(0, 360) if rng.random() < 0.4 else rng.integers(4) * 90 + rng.normal(0, 4)
-    shrunk = min(1.0, 1.4 * SIDE / span)  # area-averaged first, so that the rotation does not alias
+    shrunk = min(1.0, 1.4 * SIDE / span)  # area-averaged first, so that the rotation causes no aliasing
     small = cv2.resize(photograph, None, fx=shrunk, fy=shrunk, interpolation=cv2.INTER_AREA)
     matrix = cv2.getRotationMatrix2D((0, 0), angle, SIDE / (span * shrunk))
     centre = np.array([rng.uniform(0.3, 0.7) * small.shape[1], rng.uniform(0.3, 0.7) * small.shape[0]])
@@ -140,9 +146,9 @@ def _recolour(rng: np.random.Generator, image: Float[np.ndarray, "_ _ 3"], tint:
 
 
 def _colour_pattern(rng: np.random.Generator, pattern: Pattern) -> Picture:
-    """Blend two colours by a pattern in 0..1, with noise as on real surfaces."""
+    """Blend two random colours by a pattern in 0..1, and add noise as on real surfaces."""
     low, high = draw_natural_colour(rng), draw_natural_colour(rng)
-    # Colours of equal brightness are rare in nature and invisible to a grey matcher.
+    # Colours of equal brightness are rare in nature, and grey images cannot distinguish them.
     if abs(low.mean() - high.mean()) < 30:
         low, high = low * 0.5, high * 0.7 + 70
     grain = rng.uniform(0.02, 0.12) * draw_power_noise(rng, rng.uniform(0.7, 1.4))
@@ -159,7 +165,7 @@ def _sand(rng: np.random.Generator) -> Picture:
 
 def _make_coloured_noise(rng: np.random.Generator, exponent: float) -> Picture:
     bright, warm, green = (draw_power_noise(rng, exponent) for _ in range(3))
-    # Photographs vary most in brightness, less in blue-yellow, least in green-magenta.
+    # Photographs vary most in brightness, less in blue-yellow, and least in green-magenta.
     axes = np.array([[1, 1, 1], [1, 0, -1], [0.5, -1, 0.5]])
     strength = rng.uniform(15, 55) * np.array([1, rng.uniform(0.05, 0.35), rng.uniform(0.03, 0.2)])
     waves = np.stack([bright, warm, green], axis=-1) @ (strength[:, None] * axes).astype(np.float32)
@@ -172,7 +178,7 @@ def _marble(rng: np.random.Generator) -> Picture:
 
 
 def _dead_leaves(rng: np.random.Generator) -> Picture:
-    """Draw dead leaves: overlapping shapes of all sizes, a classic model of natural images."""
+    """Draw overlapping shapes of all sizes, the "dead leaves" model of natural images."""
     # Counts fall with the cube of the size, so that every size covers the same area.
     inverse_squares = rng.uniform(1 / rng.uniform(30, 120) ** 2, 1 / rng.uniform(2, 5) ** 2, 1500)
     return _strew(rng, inverse_squares**-0.5, slim=rng.uniform(0.25, 0.9))
@@ -201,7 +207,7 @@ def _soften(image: Picture) -> Picture:
 
 
 def _grain(rng: np.random.Generator) -> Picture:
-    """Draw wood grain: fibres, and warped rings around a distant axis."""
+    """Draw wood grain with fibres and with warped rings around a distant axis."""
     x, y = _make_turned_grid(rng)
     warp = draw_power_noise(rng, 2.0) * rng.uniform(3, 12)
     rings = np.hypot(x * rng.uniform(0.02, 0.2), y + warp - rng.uniform(-300, 300)) / rng.uniform(6, 30)

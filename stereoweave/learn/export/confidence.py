@@ -21,12 +21,12 @@ _SIZE = (320, 512)
 
 
 def calibrate_confidence(network: WeaveNet) -> dict[str, Any]:
-    """Calibrate the network's confidence in place. Returns its reliability on other pairs.
+    """Calibrate the network's confidence in place. Returns the reliability on other pairs.
 
-    A scale and a shift of the logits (Platt 1999) are fitted and folded into the last layers. Reliability is
-    measured on pairs that were not used for the fit. It consists of the `calibration_error` and, for each
-    confidence bin, the `claimed` probability of an error within 1 px, how often that `happened`, and the
-    bin's `share` of all pixels.
+    A scale and a shift of the logits (Platt 1999) are fitted and folded into the last layers. The reliability
+    is measured on pairs that were not used for the fit. It consists of the `calibration_error` and, for each
+    confidence bin, the `claimed` probability that the error is within 1 px, the observed frequency of this
+    (`happened`), and the bin's `share` of all pixels.
     """
     scale, shift = _fit_scale_and_shift(*_predict_claims(network, _FIT_SEED))
     with torch.no_grad():
@@ -34,14 +34,14 @@ def calibrate_confidence(network: WeaveNet) -> dict[str, Any]:
             assert layer.bias is not None
             layer.weight *= scale
             layer.bias *= scale
-            # The layers' outputs are summed, so only one of them is shifted.
+            # The layers' outputs are summed, so only one layer is shifted.
             layer.bias += shift if index == 0 else 0
     logits, within = _predict_claims(network, _PROOF_SEED)
     return measure_reliability(logits.sigmoid().numpy(), within.numpy())
 
 
 def measure_reliability(probability: np.ndarray, happened: np.ndarray) -> dict[str, Any]:
-    """Return claimed and observed probability per bin of equal width, and the expected calibration error."""
+    """Return claimed and observed probabilities in equal-width bins, and the expected calibration error."""
     bins = calibration_bins(probability, happened).round(4).T.tolist()
     rows = [dict(zip(("claimed", "happened", "share"), row, strict=True)) for row in bins]
     return {"calibration_error": round(calibration_error(probability, happened), 4), "bins": rows}
@@ -54,7 +54,7 @@ def paint_unseen_pair() -> StereoPair:
 
 
 def _predict_claims(network: WeaveNet, seed: int) -> tuple[Tensor, Tensor]:
-    """Return confidence logits, and whether disparity is within 1 px, at every 29th pixel of unseen pairs."""
+    """Return confidence logits, and whether the error is within 1 px, at every 29th pixel of unseen pairs."""
     logits, within = [], []
     for index in range(_PAIRS):
         made = paint_collage(seed, 0, index, *_SIZE)
@@ -87,7 +87,7 @@ def _fit_scale_and_shift(logits: Tensor, within: Tensor) -> tuple[float, float]:
 
 
 def draw_reliability(reliability: dict[str, Any], picture: Path) -> None:
-    """Plot observed against claimed probability, with the share of pixels in each bin below."""
+    """Plot the observed against the claimed probability, with the share of pixels in each bin below."""
     from matplotlib.figure import Figure
 
     bins = reliability["bins"]

@@ -1,4 +1,4 @@
-"""Matcher files of `stereoweave export`, made from a trained network or another matcher file."""
+"""Matcher files that `stereoweave export` makes from a trained network or another matcher file."""
 
 import shutil
 import tempfile
@@ -21,13 +21,13 @@ from stereoweave.stereo import StereoPair
 
 @dataclass(frozen=True, kw_only=True)
 class MatcherFiles:
-    """Output files of an export.
+    """Output files of an export; None for each variant that is not wanted.
 
     Attributes:
         out: The .onnx file in float32.
         half: The .onnx file in float16.
         eight_bits: The .onnx file with 8-bit convolutions.
-        size: The only width and height that the files accept; None if they accept any size.
+        size: The only width and height that the files accept, or None if they accept any size.
     """
 
     out: Path | None = None
@@ -43,9 +43,13 @@ class MatcherFiles:
             )
         for file in self.paths:
             if file.suffix != ".onnx":
-                raise StereoweaveError(f"{file}: expected a name that ends in .onnx")
+                raise StereoweaveError(
+                    f"{file}: expected the file extension .onnx, found {file.suffix or 'none'}"
+                )
         if len(set(self.paths)) < len(self.paths):
-            raise StereoweaveError(f"{self.paths[0]}: expected a different file for each variant")
+            raise StereoweaveError(
+                f"{self.paths[0]}: expected a different file for each variant, found the same file twice"
+            )
 
     @property
     def paths(self) -> list[Path]:
@@ -88,7 +92,7 @@ def write_weights(run: Path, out: Path) -> str:
         StereoweaveError: `run` has no checkpoint, or `out` does not end in .pt.
     """
     if out.suffix != ".pt":
-        raise StereoweaveError(f"{out}: expected a name that ends in .pt")
+        raise StereoweaveError(f"{out}: expected the file extension .pt, found {out.suffix or 'none'}")
     kept = checkpoint.load(run / "last.pt" if run.is_dir() else run)
     make_parent_folder(out)
     checkpoint.save(checkpoint.strip_to_average(kept), out)
@@ -96,7 +100,7 @@ def write_weights(run: Path, out: Path) -> str:
 
 
 def is_matcher(source: str) -> bool:
-    """Return whether an export's source is a matcher file or shipped model, not a trained network."""
+    """Return whether an export's source is a matcher file or shipped model rather than a trained network."""
     return source.endswith(".onnx") or source in shipped_models()
 
 
@@ -130,7 +134,9 @@ def _write_variants(made: Path, files: MatcherFiles) -> Iterator[str]:
 def _check_apart(source: Path, files: MatcherFiles) -> None:
     for file in files.paths:
         if file.resolve() == source.resolve():
-            raise StereoweaveError(f"{file}: expected an output file other than the source")
+            raise StereoweaveError(
+                f"{file}: expected an output file other than the source, found the source itself"
+            )
 
 
 def _copy(source: Path, out: Path) -> None:

@@ -13,31 +13,31 @@ from stereoweave.io.images import SMALLEST_SIDE_PX
 from stereoweave.learn.export.graph import write_card
 from stereoweave.matching.matcher import Matcher
 
-# Operators whose shapes or control flow depend on values, which runtimes with fixed shapes cannot plan.
+# Operators whose shapes or control flow depend on values; runtimes with fixed shapes cannot plan them.
 SHAPES_BY_VALUE = ("If", "Loop", "NonZero", "Range", "Scan", "Shape", "Unique")
 
 
 def fix_size(source: Path, out: Path, width: int, height: int) -> dict[str, Any]:
     """Write a matcher file for single pairs of the given size, and its card as .json. Returns the card.
 
-    The new file computes the same values as the source. All shapes in its graph are constants, so no
-    operator computes one.
+    The new file computes the same values as the source. All shapes in its graph are constants, so it contains
+    no operators that compute shapes.
 
     Args:
-        source: Matcher file for pairs of any size, in float32, 16 or 8 bits.
-        out: The .onnx file to write; may be the source.
+        source: Matcher file for pairs of any size, in float32, float16 or 8 bits.
+        out: The .onnx file to write; it may be the source.
         width: Width in pixels.
         height: Height in pixels.
 
     Raises:
-        StereoweaveError: The network does not accept the size, or the source is already for one size.
+        StereoweaveError: The network does not accept the size, or the source already has a fixed size.
     """
     matcher = Matcher(source)
     if matcher.fixed_size:
         found = f"{matcher.fixed_size[1]}x{matcher.fixed_size[0]}"
         raise StereoweaveError(
             f"{source}: expected a matcher file for pairs of any size, found one for {found} only; "
-            "use the file that it was made from"
+            "use the file from which it was made"
         )
     check_size(width, height, matcher.multiple_of)
     make_folder(out.parent)
@@ -49,12 +49,12 @@ def fix_size(source: Path, out: Path, width: int, height: int) -> dict[str, Any]
 
 
 def check_size(width: int, height: int, multiple_of: int) -> None:
-    """Raise StereoweaveError for a size that the network does not accept."""
+    """Raise StereoweaveError if the network does not accept the size."""
     if min(width, height) < SMALLEST_SIDE_PX or width % multiple_of or height % multiple_of:
         suggested = "x".join(str(max(-(-x // multiple_of), 2) * multiple_of) for x in (width, height))
         raise StereoweaveError(
             f"expected multiples of {multiple_of} that are at least {SMALLEST_SIDE_PX}, "
-            f"found {width}x{height}; choose {suggested}, to which smaller pictures are padded",
+            f"found {width}x{height}; choose {suggested}; smaller pictures are padded to it",
             setting="size",
         )
 

@@ -1,4 +1,4 @@
-"""Matcher files in float16: half as large, and faster on processors with native float16."""
+"""Matcher files in float16, which are half as large and faster on processors with native float16."""
 
 from collections.abc import Set
 from pathlib import Path
@@ -15,7 +15,7 @@ from stereoweave.learn.export.graph import add_nodes_between, read_graph, write_
 from stereoweave.matching.matcher import Matcher
 
 LARGEST_MEAN_DIFFERENCE_PX = 0.02
-# Different from the seeds of recipes, validation, confidence and 8 bits.
+# Different from the seeds of recipes, validation, confidence calibration and quantisation.
 _PROOF_SEED, _PROOF_PAIRS = 6_000_011, 8
 _SIZE = (320, 512)
 
@@ -31,7 +31,7 @@ def convert_to_float16(source: Path, out: Path) -> dict[str, Any]:
 
     Raises:
         StereoweaveError: The source is not such a file, or the disparities differ by 0.02 px or more on
-            average; nothing is written.
+            average. Nothing is written in either case.
     """
     graph = read_graph(source)
     make_folder(out.parent)
@@ -40,7 +40,7 @@ def convert_to_float16(source: Path, out: Path) -> dict[str, Any]:
         mean_px = _mean_difference_px(Matcher(source), Matcher(temporary))
         if not mean_px < LARGEST_MEAN_DIFFERENCE_PX:
             raise StereoweaveError(
-                f"{source}: expected 16 bits to change disparity by less than "
+                f"{source}: expected float16 to change disparity by less than "
                 f"{LARGEST_MEAN_DIFFERENCE_PX} px on average, found {mean_px:.3f} px; nothing was written"
             )
     return write_card(
@@ -54,8 +54,8 @@ def select_float16_nodes(graph: onnx.ModelProto) -> set[str]:
     They are the convolutions, the matrix products that correlate the views, and the nodes between them.
     Everything that reads or writes a disparity stays in float32, because at 192 px float16 has a resolution
     of only 1/8 px. The sum of matching scores from which the disparity is read also stays in float32. On
-    painted pairs, converting all other nodes as well leaves the mean difference unchanged and increases the
-    largest one.
+    painted pairs, converting all other nodes as well leaves the mean difference unchanged but increases the
+    largest difference.
     """
     products = (node.name for node in graph.graph.node if node.op_type in ("Conv", "MatMul"))
     between = ("Concat", "Resize", "Relu", "Add", "Slice", "Pad", "Transpose")
@@ -63,7 +63,7 @@ def select_float16_nodes(graph: onnx.ModelProto) -> set[str]:
 
 
 def cast_to_float16(graph: onnx.ModelProto, names: Set[str]) -> onnx.ModelProto:
-    """Convert weights and values of the named nodes to float16, and insert casts around them.
+    """Convert the weights and values of the named nodes to float16, and insert casts around the nodes.
 
     ONNX Runtime's own converter rounds to float16 between any two float32 nodes, so it is not used.
     """
@@ -105,7 +105,7 @@ class _Casts:
         self.weights: list[TensorProto] = []
 
     def half(self, value: str) -> str:
-        """Return the name of the value in float16, or its own name if it needs no conversion."""
+        """Return the name of the value's float16 version, or its own name if it needs no conversion."""
         if value in self._stored:
             return self._weight(value)
         if value in self._floats - self._halves:
@@ -113,7 +113,7 @@ class _Casts:
         return value
 
     def single(self, value: str) -> str:
-        """Return the name of the value in float32."""
+        """Return the name of the value's float32 version."""
         return self._cast(value, "single", TensorProto.FLOAT) if value in self._halves else value
 
     def take(self) -> list[onnx.NodeProto]:

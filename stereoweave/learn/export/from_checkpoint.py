@@ -1,4 +1,4 @@
-"""Export of a checkpoint as a matcher file: calibrate, convert, and verify agreement with PyTorch."""
+"""Export of a checkpoint as a matcher file, with calibration, conversion and a check against PyTorch."""
 
 import json
 import logging
@@ -27,7 +27,7 @@ from stereoweave.learn.training.objective import CodeObjective
 from stereoweave.matching.matcher import Matcher
 from stereoweave.stereo import StereoPair
 
-# WeaveNet has all of these outputs; the paper's network and its rivals have only the first.
+# WeaveNet has all of these outputs; each `CodeNetwork` has only the first.
 OUTPUTS = ["disparity_px", "right_disparity_px", "confidence_logit"]
 # Rounding makes PyTorch and ONNX Runtime differ, but by less than these limits.
 LARGEST_DIFFERENCE_PX = 0.01
@@ -38,12 +38,13 @@ def export_matcher(trained: Path, out: Path, pairs: Iterable[StereoPair] = ()) -
     """Write a checkpoint's averaged network as a matcher file, and its card as .json. Returns the card.
 
     Args:
-        trained: Checkpoint, or folder of a run, whose last checkpoint is used.
-        out: The .onnx file.
+        trained: Checkpoint, or folder of a run whose last checkpoint is used.
+        out: The .onnx file to write.
         pairs: Pairs on which ONNX Runtime and PyTorch must agree, in addition to one collage.
 
     Raises:
-        StereoweaveError: The two differ by at least 0.01 px or 0.01 in confidence; nothing is written.
+        StereoweaveError: ONNX Runtime and PyTorch differ by at least 0.01 px, or by at least 0.01 in
+            confidence. Nothing is written.
     """
     kept = checkpoint.load(trained / "last.pt" if trained.is_dir() else trained)
     network = load_matcher_network(kept)
@@ -58,9 +59,9 @@ def export_matcher(trained: Path, out: Path, pairs: Iterable[StereoPair] = ()) -
         px, of_confidence = np.max(found, axis=0).tolist()
         if not (px < LARGEST_DIFFERENCE_PX and of_confidence < LARGEST_DIFFERENCE_OF_CONFIDENCE):
             raise StereoweaveError(
-                f"{trained}: ONNX Runtime and PyTorch differ by {px:.3f} px and by {of_confidence:.3f} in "
-                f"confidence, expected less than {LARGEST_DIFFERENCE_PX} px and "
-                f"{LARGEST_DIFFERENCE_OF_CONFIDENCE}; nothing was written"
+                f"{trained}: expected ONNX Runtime and PyTorch to differ by less than "
+                f"{LARGEST_DIFFERENCE_PX} px and less than {LARGEST_DIFFERENCE_OF_CONFIDENCE} in confidence, "
+                f"found {px:.3f} px and {of_confidence:.3f}; nothing was written"
             )
     agreement = {
         "onnx_differs_px": px,
@@ -74,7 +75,7 @@ def export_matcher(trained: Path, out: Path, pairs: Iterable[StereoPair] = ()) -
 
 
 class DisparityNetwork(nn.Module):
-    """A `CodeNetwork` as a matcher, whose output is the left view's disparity in pixels [B, 1, H, W]."""
+    """Wrapper of a `CodeNetwork` that outputs the left view's disparity in pixels [B, 1, H, W]."""
 
     def __init__(self, network: Any, recipe: Recipe) -> None:
         super().__init__()
@@ -100,7 +101,7 @@ def load_matcher_network(kept: Checkpoint) -> Any:
     if kept.recipe.target != "disparity":
         raise StereoweaveError(
             f"{kept.recipe.name}: expected target = 'disparity', found {kept.recipe.target!r}; "
-            "a matcher file has no camera to convert depth to disparity"
+            "a matcher file has no camera with which to convert depth to disparity"
         )
     if isinstance(network, PSMNet):
         raise StereoweaveError(
@@ -114,13 +115,13 @@ def export_graph(network: Any, kept: Checkpoint) -> onnx.ModelProto:
     """Export the network as an ONNX graph with a matcher's metadata, for any batch, height and width.
 
     Height and width must be multiples of `network.multiple_of`. The dynamic batch size increases the run time
-    by less than 1 %, which is within noise.
+    by less than 1 %, which is within measurement noise.
     """
     height, width = (network.multiple_of * torch.export.Dim(name, min=2, max=1024) for name in ("h", "w"))
     sides = {0: torch.export.Dim("batch"), 2: height, 3: width}
     graph = _export_clean_graph(network, 4 * network.multiple_of, 8 * network.multiple_of, (sides, sides))
     first, *_ = graph.graph.input[0].type.tensor_type.shape.dim
-    # The exporter does not report if a network's code fixes a dynamic dimension.
+    # The exporter does not report whether a network's code fixes a dynamic dimension.
     assert first.dim_param, "the network's code fixes the batch size"
     properties = {
         "name": kept.recipe.name,
@@ -136,7 +137,7 @@ def export_graph(network: Any, kept: Checkpoint) -> onnx.ModelProto:
 
 
 def export_fixed_graph(network: Any, height: int, width: int) -> onnx.ModelProto:
-    """Export the network as an ONNX graph for pairs of one size."""
+    """Export the network as an ONNX graph for pairs of the given size."""
     return _export_clean_graph(network, height, width, None)
 
 
@@ -192,7 +193,7 @@ def compare_runtimes(network: Any, matcher: Matcher, pair: StereoPair) -> tuple[
     tensors = [torch.from_numpy(x).permute(2, 0, 1)[None].float() / 255 for x in (left, right)]
     with torch.no_grad():
         expected = [x[0, 0] for x in network(*tensors)]
-    # In one piece: `estimate` would match large pairs in strips, with slightly different results.
+    # Run in one piece, because `estimate` would match large pairs in strips, with slightly different results.
     found = [torch.from_numpy(x) for x in matcher._run(left, right) if x is not None]
     largest_px = max(float((found[i] - x).abs().max()) for i, x in enumerate(expected[:2]))
     if len(expected) < len(OUTPUTS):
@@ -209,7 +210,8 @@ def count_multiply_adds(network: nn.Module, height: int = 480, width: int = 640)
     if not isinstance(network, WeaveNet):
         return counted
     # The counter covers only convolutions and matrix products, but the refinement correlates both views by
-    # elementwise products. To interpolate between products, it needs one more column than it has matches.
+    # elementwise products. Without warping, it interpolates between products, so it needs one more product
+    # than it has matches.
     nearby = 2 * network.refinement.radius + 1 + (not network.size.warps)
     counted += 2 * (height // 2) * (width // 2) * network.size.compared * nearby
     if network.sharpening is None:

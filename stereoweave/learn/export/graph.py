@@ -1,4 +1,4 @@
-"""ONNX graphs of matcher files, from which the float16, 8-bit and fixed-size variants are made."""
+"""Functions shared by the exports of float16, 8-bit and fixed-size matcher files."""
 
 import json
 from collections import defaultdict
@@ -28,17 +28,17 @@ def read_graph(source: Path) -> onnx.ModelProto:
     elif any(node.op_type == "QuantizeLinear" for node in graph.graph.node):
         found = "one in 8 bits"
     elif any(value.data_type == TensorProto.FLOAT16 for value in graph.graph.initializer):
-        found = "one in 16 bits"
+        found = "one in float16"
     if found:
         raise StereoweaveError(
             f"{source}: expected a matcher file in float32 for pairs of any size, found {found}; "
-            "use the file that it was made from"
+            "use the file from which it was made"
         )
     return graph
 
 
 def write_card(source: Path, out: Path, facts: dict[str, Any]) -> dict[str, Any]:
-    """Write the card of a derived file: the source's card updated with `facts`. Returns the card."""
+    """Write a derived file's card, the source's card updated with `facts`. Returns the new card."""
     file = source.with_suffix(".json")
     card = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
     card |= facts
@@ -48,9 +48,10 @@ def write_card(source: Path, out: Path, facts: dict[str, Any]) -> dict[str, Any]
 
 
 def add_nodes_between(graph: onnx.ModelProto, names: Iterable[str], operations: tuple[str, ...]) -> set[str]:
-    """Return the named nodes, the nodes between them, and the ReLUs after their convolutions.
+    """Return the names of the given nodes, the nodes between them, and the ReLUs after convolutions.
 
-    A node of the given operations counts as between them if only chosen nodes read its outputs.
+    A node with one of `operations` counts as between the given nodes if only chosen nodes read its outputs.
+    The returned ReLUs are those that read the output of a chosen convolution.
     """
     readers = defaultdict(list)
     for node in graph.graph.node:

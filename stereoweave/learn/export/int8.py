@@ -1,4 +1,4 @@
-"""Matcher files with 8-bit convolutions: a third of the size, and faster on CPUs with 8-bit products."""
+"""Matcher files with 8-bit convolutions, a third as large and faster on CPUs with 8-bit products."""
 
 import io
 import tempfile
@@ -30,19 +30,19 @@ LARGEST_LOSS_PX = 0.05
 _RANGES_SEED, _PROOF_SEED = 4_000_037, 5_000_011
 _RANGES_PAIRS, _PROOF_PAIRS = 6, 24
 _SIZE = (320, 512)
-# Percentile of a map's values that its quantisation range covers. Outliers are clipped to keep steps small.
+# Percentile of a map's values that the quantisation range covers. Outliers are clipped to keep steps small.
 _RANGE_PERCENTILE = 99.99
-# These layers stay in float32, because they resolve fractions of a pixel; in 8 bits they would double the
-# loss.
+# These layers stay in float32, because they resolve fractions of a pixel. In 8 bits they would double the
+# loss of accuracy.
 _KEPT = ("refinement.", "sharpening.")
 
 
 def quantise(source: Path, out: Path) -> dict[str, Any]:
     """Write a WeaveNet's matcher file with 8-bit convolutions, and its card as .json. Returns the card.
 
-    Activations use 8 bits. Weights use 7 of their 8 bits, with one scale per channel: with all 8 bits, sums
-    of two products overflow on CPUs that have AVX2 but no 8-bit dot products (ONNX Runtime, "Quantize ONNX
-    Models").
+    Activations use 8 bits. Weights have one scale per channel and use 7 of their 8 bits, because with all 8
+    bits, sums of two products would overflow on CPUs that have AVX2 but no 8-bit dot products (ONNX Runtime,
+    "Quantize ONNX Models").
 
     Args:
         source: Matcher file in float32 for pairs of any size.
@@ -50,7 +50,7 @@ def quantise(source: Path, out: Path) -> dict[str, Any]:
 
     Raises:
         StereoweaveError: The source is not such a file, or the mean error grows by 0.05 px or more on pairs
-            that did not determine the quantisation ranges; nothing is written.
+            that did not determine the quantisation ranges. Nothing is written in either case.
     """
     graph = read_graph(source)
     make_folder(out.parent)
@@ -72,9 +72,9 @@ def quantise(source: Path, out: Path) -> dict[str, Any]:
 def select_int8_nodes(graph: onnx.ModelProto) -> list[str]:
     """Return the names of the nodes to compute in 8 bits.
 
-    They are all convolutions except those of refinement and sharpening, and nodes that only these nodes read.
-    Disparities, correlations and their inputs stay in float32, because 8 bits would round a disparity to
-    whole pixels.
+    They are all convolutions except those of refinement and sharpening, the nodes between these convolutions,
+    and the ReLUs after them. Disparities, correlations and their inputs stay in float32, because 8 bits would
+    round a disparity to whole pixels.
     """
     convolutions = (
         node.name

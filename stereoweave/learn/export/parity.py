@@ -1,4 +1,4 @@
-"""Accuracy and speed of the shipped networks in every variant and runtime, relative to PyTorch in float32."""
+"""Accuracy and speed of the shipped networks in every variant and runtime, compared with PyTorch."""
 
 import contextlib
 import math
@@ -31,7 +31,7 @@ from stereoweave.system.threads import thread_count
 
 # Different from the seeds of recipes, validation, confidence and the variants' own checks.
 _SEED, _PAIRS = 7_000_003, 4
-# Height and width of the pairs. Times are measured at the last one, the size of the fixed-size file.
+# Height and width of the pairs. Times are measured at the last size, which is that of the fixed-size file.
 SIZES = ((240, 320), (320, 512), (480, 640))
 _TURNS = 7
 
@@ -41,17 +41,17 @@ class ParityRow:
     """Differences between one variant and PyTorch in float32, over all pixels of painted pairs.
 
     Attributes:
-        network: The shipped network.
-        variant: Variant of its matcher file.
+        network: Name of the shipped network.
+        variant: Name of the variant.
         provider: Execution provider, a name in PROVIDERS.
         onnxruntime: Version of ONNX Runtime.
         file_mb: Size of the file in 10^6 bytes.
         pairs: Number of pairs compared.
-        left_mean_px, left_max_px: Absolute differences of the left view's disparity.
-        right_mean_px, right_max_px: Absolute differences of the right view's disparity.
-        confidence_mean, confidence_max: Absolute differences of the confidence, a probability.
-        time_ms: Shortest time for a pair of 640x480 over several runs.
-        time_relative: Time relative to float32 on the same provider, measured in alternation.
+        left_mean_px, left_max_px: Mean and largest absolute difference in the left view's disparity.
+        right_mean_px, right_max_px: Mean and largest absolute difference in the right view's disparity.
+        confidence_mean, confidence_max: Mean and largest absolute difference in confidence, a probability.
+        time_ms: Shortest time for a 640x480 pair over several runs.
+        time_relative: Time divided by that of float32 on the same provider, measured in alternating runs.
         commit: Commit of the code.
     """
 
@@ -81,7 +81,7 @@ class MatcherVariant(NamedTuple):
 
 
 class NetworkMaps(NamedTuple):
-    """A network's outputs: disparity of both views, and the left view's confidence in 0..1."""
+    """A network's outputs: the disparities of both views, and the left view's confidence in 0..1."""
 
     left_px: Float32[np.ndarray, "b 1 h w"]
     right_px: Float32[np.ndarray, "b 1 h w"]
@@ -153,7 +153,7 @@ def _measure_network(path: Path, folder: Path) -> list[ParityRow]:
 
 
 def make_variants(file: Path, folder: Path) -> dict[str, MatcherVariant]:
-    """Return every variant of a shipped matcher file by name; derived files are written to `folder`."""
+    """Return every variant of a shipped matcher file, keyed by name; new files are written to `folder`."""
     height, width = SIZES[-1]
     half, eight_bits, fixed = (folder / f"{file.stem}_{x}.onnx" for x in ("fp16", "8bit", "fixed"))
     convert_to_float16(file, half)
@@ -169,7 +169,7 @@ def make_variants(file: Path, folder: Path) -> dict[str, MatcherVariant]:
 
 
 def apply_shipped_calibration(network: WeaveNet, file: Path) -> WeaveNet:
-    """Set a network's confidence layers to the calibrated ones of its shipped matcher file."""
+    """Copy the calibrated confidence layers of a shipped matcher file into its network."""
     weights = {x.name: x for x in onnx.load(file).graph.initializer}
     with torch.no_grad():
         for name, parameter in network.named_parameters():
@@ -211,7 +211,7 @@ def run_in_onnx_runtime(session: Any, batch: int, views: Mapping[str, np.ndarray
 def summarise_differences(
     expected: Mapping[tuple[int, int], NetworkMaps], found: Mapping[tuple[int, int], NetworkMaps]
 ) -> dict[str, float]:
-    """Return mean and largest absolute differences over all pixels of all sizes, keyed by field of a row."""
+    """Return the mean and largest absolute differences over all pixels, keyed by `ParityRow` field."""
     summary = {}
     for field, unit in (("left", "_px"), ("right", "_px"), ("confidence", "")):
         name = field + unit
@@ -228,7 +228,7 @@ def list_providers() -> list[str]:
 
 
 def _open_sessions(made: Mapping[str, MatcherVariant], provider: str) -> dict[str, Any]:
-    """Open a session for each variant, except variants that a provider other than the CPU rejects."""
+    """Open a session for each variant, skipping those that a provider other than the CPU rejects."""
     sessions = {}
     for name, variant in made.items():
         with contextlib.nullcontext() if provider == CPU else contextlib.suppress(MatcherError):

@@ -1,4 +1,4 @@
-"""Registry of the networks by their names in recipes."""
+"""Registry of the networks, keyed by their names in recipes."""
 
 from collections.abc import Callable
 from functools import partial
@@ -28,13 +28,13 @@ MODELS: dict[str, Callable[..., Any]] = {
 
 @runtime_checkable
 class CodeNetwork(Protocol):
-    """Interface of the paper's network and its rivals.
+    """Interface of the paper's network and of the networks with which it is compared.
 
-    They map images [B, 3, H, W] in 0..1, of any size, to maps [B, 1, H, W].
+    Such a network maps a pair of images [B, 3, H, W] in 0..1, of any size, to one map [B, 1, H, W].
 
     Attributes:
-        predicts: Whether a map holds the code of a `DepthCurve` or disparity in pixels.
-        output_weights: Weight of each of `outputs` in the loss.
+        predicts: Whether the map holds the code of a `DepthCurve` or the disparity in pixels.
+        output_weights: Loss weight of each of `outputs`.
     """
 
     predicts: Literal["code", "disparity_px"]
@@ -52,9 +52,9 @@ class CodeNetwork(Protocol):
 
 
 def build_network(recipe: Recipe) -> Any:
-    """Build the network of a recipe with random weights. Raises FormatError for an unknown name."""
+    """Build a recipe's network with random weights. Raises FormatError if its name is unknown."""
     if recipe.model not in MODELS:
-        raise FormatError(f"{recipe.name}: model = {recipe.model!r}, expected {' or '.join(MODELS)}")
+        raise FormatError(f"{recipe.name}: model = {recipe.model!r}, expected one of {', '.join(MODELS)}")
     if recipe.model == "psmnet":
         # The only network whose disparity range is an argument.
         return PSMNet(int(recipe.max_disparity_px))

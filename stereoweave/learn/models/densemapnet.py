@@ -1,11 +1,12 @@
 """DenseMapNet: R. Atienza, "Fast Disparity Estimation Using Dense Networks", ICRA 2018.
 
-It is the predecessor of the paper's network. Both match the two views stacked and pooled by 8; DenseMapNet
-upsamples the result by 8 in one step. Shared parts are in layers.py. The layers match the published weights
-(github.com/roatienza/densemapnet, MIT licence), which `load_keras` reads.
+It is the predecessor of the paper's network. Both networks match the two views after stacking them and
+pooling by 8. DenseMapNet then upsamples the result by 8 in one step. Layers that both networks use are in
+layers.py. The layers match the published weights (github.com/roatienza/densemapnet, MIT licence), which
+`load_keras` reads.
 
 Deviation: images whose sides are not multiples of 8 are padded below and on the right by repeating border
-pixels, and the result is cropped; the published code zero-pads its maps internally.
+pixels, and the result is cropped. The published code zero-pads its feature maps instead.
 """
 
 from collections import Counter
@@ -22,7 +23,7 @@ from torch import Tensor, nn
 from stereoweave.errors import FormatError
 from stereoweave.learn.models.layers import CodeHead, PooledMatching, initialise_as_keras, pad_to_multiple
 
-# Each layer's name in a Keras file, and the Keras names of its tensors.
+# Name of each layer type in a Keras file, and the Keras names of its tensors.
 _KERAS_NAMES: dict[type[nn.Module], tuple[str, dict[str, str]]] = {
     nn.Conv2d: ("conv2d", {"weight": "kernel", "bias": "bias"}),
     nn.ConvTranspose2d: ("conv2d_transpose", {"weight": "kernel", "bias": "bias"}),
@@ -39,14 +40,14 @@ _KERAS_NAMES: dict[type[nn.Module], tuple[str, dict[str, str]]] = {
 
 
 class DenseMapNet(nn.Module):
-    """The network that the paper builds on, which predicts a disparity code in 0..1 for each left pixel.
+    """Network on which the paper builds. It predicts a disparity code in 0..1 for each left pixel.
 
-    290,290 parameters; 8.41 G multiply-adds at 640x480.
+    The network has 290,290 parameters and takes 8.41 G multiply-adds at 640x480.
 
     Args:
-        channels: 3 for RGB; 1 for grey (286,240 parameters), as published for KITTI 2015. A grey network also
-            takes RGB and converts it by Rec. 601, like OpenCV and Pillow; the author's own conversion is
-            unknown.
+        channels: 3 for RGB, or 1 for grey (286,240 parameters), as published for KITTI 2015. The inputs of a
+            grey network are also RGB. It converts them to grey with the Rec. 601 weights, as OpenCV and
+            Pillow do; the author's own conversion is unknown.
     """
 
     multiple_of = 8
@@ -63,7 +64,7 @@ class DenseMapNet(nn.Module):
     def outputs(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
     ) -> tuple[Float[Tensor, "b 1 h w"]]:
-        """Return the only supervised output, the code."""
+        """Return the code, the only supervised output."""
         height, width = left.shape[2:]
         left, right = (pad_to_multiple(view, self.multiple_of) for view in (left, right))
         if self.channels == 1:
@@ -75,7 +76,7 @@ class DenseMapNet(nn.Module):
     def forward(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
     ) -> Float[Tensor, "b 1 h w"]:
-        """Return the left view's code [B, 1, H, W] in 0..1; near is high.
+        """Return the left view's code [B, 1, H, W] in 0..1; nearer surfaces have higher codes.
 
         The code of the published networks is disparity / d_max.
 
@@ -87,12 +88,12 @@ class DenseMapNet(nn.Module):
 
 
 def load_keras(path: str | Path) -> DenseMapNet:
-    """Load a published network, for RGB or grey, from a Keras HDF5 weight file. Returns it in eval mode.
+    """Load a published RGB or grey network from a Keras HDF5 weight file. Returns the network in eval mode.
 
     Its code is disparity / d_max. The file does not contain d_max, the largest disparity in training.
 
     Raises:
-        FormatError: The file is missing, is not HDF5, or its layers or shapes are not DenseMapNet's.
+        FormatError: The file is missing or not HDF5, or its layers or shapes differ from DenseMapNet's.
     """
     found = _read_hdf5(path)
     first = found.get("conv2d_1/conv2d_1/kernel:0")
@@ -113,7 +114,7 @@ def load_keras(path: str | Path) -> DenseMapNet:
 
 
 def _read_hdf5(path: str | Path) -> dict[str, np.ndarray]:
-    """Read all arrays of the file, keyed by full name."""
+    """Read all arrays in the file, keyed by their full names."""
     import h5py  # type: ignore[import-untyped]
 
     arrays = {}
@@ -129,12 +130,14 @@ def _read_hdf5(path: str | Path) -> dict[str, np.ndarray]:
         raise FormatError(f"{path}: expected Keras weights in HDF5, found no such file") from error
     except (OSError, KeyError, RuntimeError, ValueError) as error:
         # HDF5's own message is long and spans several lines; it remains in the chained exception.
-        raise FormatError(f"{path}: expected Keras weights in HDF5, found something else") from error
+        raise FormatError(
+            f"{path}: expected Keras weights in HDF5, found another format or a damaged file"
+        ) from error
     return arrays
 
 
 def _iterate_keras_tensors(network: nn.Module) -> Iterator[tuple[str, Tensor]]:
-    """Yield each tensor of the network with its Keras name and with axes in Keras's order.
+    """Yield the Keras name and the values of each tensor, with the axes in Keras's order.
 
     Keras numbers the layers of each type in the order of construction, which is the order of `modules()`.
     """

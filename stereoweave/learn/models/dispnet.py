@@ -1,11 +1,11 @@
-"""DispNet with correlation along the rows (DispNetCorr1D).
+"""DispNet with correlation along image rows (DispNetCorr1D).
 
 N. Mayer et al., A Large Dataset to Train Convolutional Networks for Disparity, Optical Flow, and Scene Flow
 Estimation, CVPR 2016, arXiv:1512.02134.
 
-conv1 and conv2 process both views. The 105 inputs of conv3a are 41 candidates and the 64 channels of
-conv_redir. Each layer has kernel area * inputs * outputs + outputs parameters, with channels from Table 1 of
-the paper:
+conv1 and conv2 process both views. The 105 input channels of conv3a are the correlations of 41 candidate
+disparities and the 64 channels of conv_redir. Each layer has kernel area * inputs * outputs + outputs
+parameters, where the numbers of input and output channels are from Table 1 of the paper:
 
     conv1     49 *    3 *   64 +   64 =     9,472
     conv2     25 *   64 *  128 +  128 =   204,928
@@ -28,9 +28,10 @@ the paper:
 
 Deviations, and choices where the paper is silent:
 
-- The paper starts with a loss on pr6 alone and shifts the weight to finer outputs during training. Here the
-  weights are constant and halve with each coarser output. Every output then learns from the first step, the
-  final one weighs about as much as all others together, and the network needs no schedule of its own.
+- The paper starts with a loss on pr6 alone and shifts the weight to finer outputs during training. Here each
+  output has a constant weight, which is half that of the next finer output. Every output is therefore trained
+  from the first step, the final output weighs about as much as all the others together, and the network needs
+  no schedule of its own.
 - A prediction is upsampled bilinearly for the next iconv, because the table names no layer for this step.
 - A leaky ReLU with a slope of 0.1 follows every convolution except the predictions.
 - Colours are scaled to -1..1.
@@ -47,39 +48,39 @@ from torch import Tensor, nn
 from stereoweave.learn.models.layers import correlation_volume, pad_to_multiple
 
 SLOPE = 0.1
-# Candidates of 0 to 40 px at 1/4 resolution, which are 0 to 160 px of the images.
+# The candidates are 0 to 40 px at 1/4 resolution, that is, 0 to 160 px at full resolution.
 LEVELS = 41
 
 
 def convolution(inputs: int, outputs: int, kernel: int, stride: int = 1) -> nn.Sequential:
-    """Build a convolution and a leaky ReLU, at 1 / `stride` of the input's resolution."""
+    """Build a convolution with the given stride, followed by a leaky ReLU."""
     return nn.Sequential(
         nn.Conv2d(inputs, outputs, kernel, stride, padding=kernel // 2), nn.LeakyReLU(SLOPE, inplace=True)
     )
 
 
 def prediction(inputs: int) -> nn.Conv2d:
-    """Build a convolution from `inputs` channels to disparity in full-resolution pixels."""
+    """Build a convolution that predicts disparity in full-resolution pixels from `inputs` channels."""
     return nn.Conv2d(inputs, 1, 3, padding=1)
 
 
 def mean_correlation(
     first: Float[Tensor, "b c h w"], second: Float[Tensor, "b c h w"]
 ) -> Float[Tensor, "b 41 h w"]:
-    """Correlate column x of `first` with column x - d of `second`, d = 0 .. 40, as a mean over channels."""
+    """Return the mean over channels of column x of `first` times column x - d of `second`, d = 0 .. 40."""
     return correlation_volume(first, second, LEVELS) / first.shape[1]
 
 
 def enlarge(map_: Float[Tensor, "b c h w"], scale: int) -> Float[Tensor, "b c h2 w2"]:
-    """Upsample bilinearly by `scale`; values are not scaled."""
+    """Upsample the map bilinearly by `scale`, without scaling its values."""
     return F.interpolate(map_, scale_factor=float(scale), mode="bilinear")
 
 
 class Expansion(nn.Module):
-    """One decoder step to twice the resolution.
+    """Decoder step that doubles the resolution.
 
-    upconv upsamples the maps, iconv joins its output with the current disparity and the encoder's maps, and
-    prediction returns the new disparity.
+    `upconv` upsamples the maps, `iconv` combines them with the current disparity and the encoder's maps, and
+    `prediction` returns the new disparity.
     """
 
     def __init__(self, inputs: int, skipped: int, outputs: int) -> None:
@@ -96,16 +97,19 @@ class Expansion(nn.Module):
         disparity_px: Float[Tensor, "b 1 h w"],
         skipped: Float[Tensor, "b c2 h2 w2"],
     ) -> tuple[Float[Tensor, "b c3 h2 w2"], Float[Tensor, "b 1 h2 w2"]]:
-        """Return maps and disparity (in full-resolution pixels) at twice the resolution of `maps`."""
+        """Return the new maps and the new disparity, both at twice the resolution of `maps`.
+
+        The disparity is in full-resolution pixels.
+        """
         maps = self.iconv(torch.cat([self.upconv(maps), enlarge(disparity_px, 2), skipped], 1))
         return maps, self.prediction(maps)
 
 
 class DispNet(nn.Module):
-    """Network that estimates the left view's disparity by correlation over 160 px.
+    """Network that estimates the left view's disparity from correlations over a range of 160 px.
 
-    42,174,022 parameters; 38.17 G multiply-adds at 640x480, padded to 640x512. The count covers convolutions
-    and the correlation of all columns with all columns, but not upsampling and activations.
+    The network has 42,174,022 parameters and takes 37.96 G multiply-adds at 640x480, padded to 640x512. The
+    multiply-adds include the convolutions and the correlation, but not upsampling or activations.
     """
 
     multiple_of = 64
@@ -137,7 +141,7 @@ class DispNet(nn.Module):
     def predictions(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
     ) -> list[Float[Tensor, "b 1 _ _"]]:
-        """Return disparities pr6 to pr1, in full-resolution pixels, at 1/64 to 1/2 of the padded size."""
+        """Return the disparities pr6 to pr1 in full-resolution pixels, at 1/64 to 1/2 of the padded size."""
         views = pad_to_multiple(torch.cat([left, right]), self.multiple_of)
         half = self.conv1(views * 2 - 1)
         batch = left.shape[0]  # not chunk(), which would fix the batch size on export
@@ -158,7 +162,7 @@ class DispNet(nn.Module):
     def outputs(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
     ) -> tuple[Float[Tensor, "b 1 h w"], ...]:
-        """Return disparities pr6 to pr1 in pixels at full resolution; the last one is the estimate."""
+        """Return the disparities pr6 to pr1 in pixels, upsampled to full resolution; pr1 is the estimate."""
         height, width = left.shape[2:]
         return tuple(
             enlarge(disparity_px.float(), 64 >> level)[..., :height, :width]
@@ -168,16 +172,17 @@ class DispNet(nn.Module):
     def forward(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
     ) -> Float[Tensor, "b 1 h w"]:
-        """Return the disparity of the left view in pixels, from RGB images in 0..1."""
+        """Return the left view's disparity in pixels, given RGB images in 0..1."""
         return self.outputs(left, right)[-1]
 
 
 def _initialise(layer: nn.Module) -> None:
-    """Draw normal weights of variance 2 / (1 + SLOPE^2) / terms (He et al. 2015).
+    """Draw weights from a normal distribution of variance 2 / (1 + SLOPE^2) / terms (He et al. 2015).
 
-    `terms` is the number of products in the sum of one output; a transposed convolution uses 1 / stride^2 of
-    its kernel per output. Without batch norm, the initialisation alone preserves the signal's scale through
-    16 layers. PyTorch's default loses about two thirds of it per layer.
+    `terms` is the number of products that are summed for one output; a transposed convolution uses
+    1 / stride^2 of its kernel for each output. As the network has no batch norm, only the initialisation
+    preserves the signal's scale through 16 layers. PyTorch's default would lose about two thirds of the scale
+    in each layer.
     """
     if isinstance(layer, nn.Conv2d | nn.ConvTranspose2d):
         kernel, stride = layer.kernel_size[0], layer.stride[0] if layer.transposed else 1

@@ -1,11 +1,11 @@
 """FastDepthNet: the network of "Fast Depth Estimation for View Synthesis", section III-A.
 
 It combines the matching of DenseMapNet (Atienza, "Fast Disparity Estimation Using Dense Networks", ICRA 2018)
-with a decoder that upsamples in steps of two, each with a skip connection from the left view. Shared parts
-are in layers.py.
+with a decoder that upsamples in steps of two, each with a skip connection from the left view. Layers that
+both networks use are in layers.py.
 
 The paper gives the structure. Filter counts, elementwise dropout and the constants of batch norm are from the
-published implementations, and the parameters add up to the same 314,722. Choices where both are silent:
+published implementations, which also have 314,722 parameters. Choices where both sources are silent:
 
 - Upsampling is by nearest neighbour, Keras's default.
 - Weights are initialised by Glorot's method and biases to 0, Keras's defaults.
@@ -30,13 +30,13 @@ from stereoweave.learn.models.layers import (
 
 
 class FastDepthNet(nn.Module):
-    """The paper's network, which predicts a code of depth or disparity in 0..1 for each left pixel.
+    """The paper's network. It predicts a code of depth or disparity in 0..1 for each left pixel.
 
-    314,722 parameters; 7.39 G multiply-adds at 640x480.
+    The network has 314,722 parameters and takes 7.39 G multiply-adds at 640x480.
 
     Args:
-        skips: Whether the decoder's steps receive the left view's pooled features. The variant without them
-            (301,858 parameters) tests the paper's claim about skip connections.
+        skips: Whether each decoder step receives the left view's pooled features. The variant without these
+            skip connections (301,858 parameters) tests the paper's claim about them.
     """
 
     multiple_of = 8
@@ -56,7 +56,7 @@ class FastDepthNet(nn.Module):
     def outputs(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
     ) -> tuple[Float[Tensor, "b 1 h w"]]:
-        """Return the only supervised output, the code."""
+        """Return the code, the only supervised output."""
         height, width = left.shape[2:]
         left, right = (pad_to_multiple(view, self.multiple_of) for view in (left, right))
         matches, features, left_channel = self.matching(left, right)
@@ -68,7 +68,9 @@ class FastDepthNet(nn.Module):
     def forward(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
     ) -> Float[Tensor, "b 1 h w"]:
-        """Return the left view's code [B, 1, H, W] in 0..1, for `DepthCurve` to decode; near is high.
+        """Return the left view's code [B, 1, H, W] in 0..1; nearer surfaces have higher codes.
+
+        A `DepthCurve` converts the code to depth or disparity.
 
         Args:
             left: Left view [B, 3, H, W], RGB in 0..1, of any size.
@@ -77,6 +79,6 @@ class FastDepthNet(nn.Module):
         return self.outputs(left, right)[-1]
 
     def _enlarge(self, x: Tensor, features: Tensor, pool: int) -> Tensor:
-        """Upsample by two, to 1/`pool` of full size, and append the left view's features at that size."""
+        """Upsample by two, to 1/`pool` of full size, and append the left view's features if `skips`."""
         enlarged = F.interpolate(x, scale_factor=2.0)
         return torch.cat([enlarged, F.max_pool2d(features, pool)], 1) if self.skips else enlarged

@@ -1,4 +1,4 @@
-"""Layers shared by the networks: convolution blocks, correlation, soft-argmax, guided upsampling."""
+"""Layers shared by the networks: convolution blocks, correlation, soft-argmax and guided upsampling."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -9,12 +9,12 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
-# Number of column blocks in a correlation. At 1/4 of images whose sides are multiples of 16, every width is a
-# multiple of four: an exported graph needs no padding and has the same number of matrix products for any
-# width.
+# Number of column blocks in a correlation. If the sides of the images are multiples of 16, the width at 1/4
+# resolution is a multiple of four, so an exported graph needs no padding and has the same number of matrix
+# products for any width.
 _BLOCKS = 4
-# Weight of a rejected neighbour. Avoids division by zero if all neighbours are rejected; the result is then
-# their mean.
+# Weight of a rejected neighbour. It avoids a division by zero if all neighbours are rejected; the result is
+# then their mean.
 _LEAST_SHARE = 1e-4
 
 
@@ -47,7 +47,7 @@ class Halve(nn.Sequential):
 
 
 class Residual(nn.Module):
-    """Two 3x3 convolutions, the first one dilated, added to their input."""
+    """Residual block of two 3x3 convolutions, the first of which is dilated."""
 
     def __init__(self, channels: int, dilation: int = 1) -> None:
         super().__init__()
@@ -64,7 +64,7 @@ Block = TypeVar("Block", Residual, nn.Conv2d)
 
 
 def zero_initialise(block: Block) -> Block:
-    """Set the block's last layer to zero, so that adding the block to a trained network changes nothing."""
+    """Zero the block's last layer, so that adding the block does not change a trained network's output."""
     last = block.second[1] if isinstance(block, Residual) else block
     for parameter in last.parameters():
         nn.init.zeros_(parameter)
@@ -74,10 +74,11 @@ def zero_initialise(block: Block) -> Block:
 class DilatedDense(nn.Module):
     """The paper's densely connected blocks of dilated convolutions.
 
-    Each block narrows all previous maps, applies a dilated convolution, and appends the result.
+    Each block reduces the number of channels of all previous maps, applies a dilated convolution, and appends
+    the result.
 
-    Deviation: norm and ReLU follow each convolution, while in the paper they precede it. Every norm can then
-    be folded into its convolution on export.
+    Deviation: batch norm and ReLU follow each convolution, while in the paper they precede it. Every batch
+    norm can therefore be folded into its convolution on export.
     """
 
     def __init__(self, inputs: int, narrow: int, growth: int, dilations: tuple[int, ...]) -> None:
@@ -105,10 +106,11 @@ def mirror(x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
 def correlation_volume(
     first: Float[Tensor, "b c h w"], second: Float[Tensor, "b c h w"], levels: int
 ) -> Float[Tensor, "b d h w"]:
-    """Correlate column x of `first` with column x - d of `second`, d = 0 .. levels - 1; 0 outside.
+    """Correlate column x of `first` with column x - d of `second`, for d = 0 .. levels - 1.
 
-    Each matrix product compares a quarter of a row's columns with all columns that they can match. At 640x480
-    this is half the work of comparing all with all. Plain reference: `correlation_volume_plain` in
+    The correlation is 0 if column x - d is outside the map. Each matrix product compares a quarter of a row's
+    columns with all columns that they can match. At 640x480 this takes half as many operations as comparing
+    every column with every other. The plain reference is `correlation_volume_plain` in
     tests/learn/models/test_layers.py.
     """
     width = first.shape[3]
@@ -125,7 +127,7 @@ def correlation_volume(
 
 
 def _diagonals(products: Float[Tensor, "b h n m"], levels: int) -> Float[Tensor, "b h n d"]:
-    """Move products[..., i, i + e] to [..., i, e], for e = 0 .. levels - 1 = m - n.
+    """Move the element at [..., i, i + e] to [..., i, e], for e = 0 .. levels - 1, where levels is m - n + 1.
 
     Reading the same elements in rows that are one element longer turns diagonals into columns.
     """
@@ -137,10 +139,10 @@ def _diagonals(products: Float[Tensor, "b h n m"], levels: int) -> Float[Tensor,
 def local_soft_argmax(logits: Float[Tensor, "b d h w"]) -> Float[Tensor, "b 1 h w"]:
     """Return the expected level under a softmax over the levels near the best one.
 
-    The window keeps a distant second candidate from pulling the mean off the surface. It first covers 2
-    levels on each side of the best one. Then it is centred on the mean three times, with weights that fade
-    out over 3 levels. The result converges to the same place even where rounding decides which of two levels
-    is best.
+    Restricting the softmax to a window keeps a distant second candidate from pulling the mean off the
+    surface. The window first covers 2 levels on each side of the best level. It is then centred on the mean
+    three times, with weights that fade out over 3 levels. Rounding that decides which of two
+    levels is best therefore hardly changes the result.
     """
     best = logits.detach().argmax(1, keepdim=True)
     near, reach = 2, 3
@@ -158,7 +160,7 @@ def local_soft_argmax(logits: Float[Tensor, "b d h w"]) -> Float[Tensor, "b 1 h 
 
 
 def expected_step(logits: Float[Tensor, "b k h w"]) -> Float[Tensor, "b 1 h w"]:
-    """Return the expectation of -radius .. radius under a softmax over channels, k = 2 * radius + 1.
+    """Return the expected step, in -radius .. radius, under a softmax over the k = 2 * radius + 1 channels.
 
     The softmax is written out, because ONNX Runtime's own softmax over channels is ten times slower.
     """
@@ -174,11 +176,11 @@ def correlate_nearby(
     disparity: Float[Tensor, "b 1 h w"],
     radius: int,
 ) -> Float[Tensor, "b k h w"]:
-    """Correlate column x of `first` with column x - disparity - k of `second`, k = -radius .. radius.
+    """Correlate column x of `first` with column x - disparity - k of `second`, for k = -radius .. radius.
 
-    The correlation is linearly interpolated between columns; columns outside the map take the border's value.
-    Offsets are processed one at a time, which keeps gathered features in the processor's cache until they are
-    summed.
+    The correlation is linearly interpolated between columns. Columns outside the map repeat the border
+    column. Offsets are processed one at a time, which keeps gathered features in the processor's cache until
+    they are summed.
     """
     batch, channels, height, width = first.shape
     whole = disparity.detach().floor()
@@ -199,11 +201,11 @@ def correlate_warped(
     disparity: Float[Tensor, "b 1 h w"],
     radius: int,
 ) -> Float[Tensor, "b k h w"]:
-    """Correlate column x of `first` with column x - k of the warped `second`, k = -radius .. radius.
+    """Correlate column x of `first` with column x - k of the warped `second`, for k = -radius .. radius.
 
-    `second` is warped by `disparity`. On smooth surfaces the result equals that of `correlate_nearby` at a
-    lower cost, because only two columns per pixel are gathered for any radius. Columns outside the map take
-    the border's value; outside the warped map the correlation is 0.
+    `second` is warped by `disparity`. On smooth surfaces the result equals that of `correlate_nearby`. It
+    takes less time to compute, because only two columns per pixel are gathered for any radius. Columns
+    outside the map repeat the border column. Outside the warped map, the correlation is 0.
     """
     batch, channels, height, width = first.shape
     columns = torch.arange(width, dtype=torch.float32, device=first.device) - disparity.detach()
@@ -222,7 +224,7 @@ def correlate_warped(
 def sample_at_match(
     other: Float[Tensor, "b 1 h w"], disparity: Float[Tensor, "b 1 h w"]
 ) -> Float[Tensor, "b 1 h w"]:
-    """Sample the other view's map at column x - disparity, linearly interpolated with a replicated border."""
+    """Sample the other view's map at column x - disparity, with linear interpolation and repeated borders."""
     width = other.shape[3]
     columns = torch.arange(width, dtype=torch.float32, device=other.device) - disparity.detach()
     columns = columns.clamp(0, width - 1)
@@ -235,7 +237,7 @@ def sample_at_match(
 def gather_neighbours(
     x: Float[Tensor, "b 1 h w"], offsets: Sequence[tuple[int, int]]
 ) -> Float[Tensor, "b k h w"]:
-    """Return the map's values at (row, column) offsets from each pixel; the border is replicated."""
+    """Return the map's values at (row, column) offsets from each pixel; the border is repeated."""
     height, width = x.shape[2:]
     reach = max(abs(side) for offset in offsets for side in offset)
     around = F.pad(x, (reach, reach, reach, reach), mode="replicate")
@@ -245,12 +247,12 @@ def gather_neighbours(
 
 
 def _pixels(x: Float[Tensor, "b c h w"]) -> Float[Tensor, "n c"]:
-    """Return features with one row per pixel, so that a lookup is one contiguous copy."""
+    """Return the features with one row per pixel, so that each lookup is one contiguous copy."""
     return x.permute(0, 2, 3, 1).reshape(-1, x.shape[1])
 
 
 def _places(columns: Float[Tensor, "b 1 h w"]) -> Int64[Tensor, " n"]:
-    """Return the row indices in `_pixels` of these integer columns, clamped to their own image row."""
+    """Return the indices in `_pixels` of the given integer columns, each clamped to its own image row."""
     batch, _, height, width = columns.shape
     lines = torch.arange(batch * height, device=columns.device).view(batch, 1, height, 1)
     # Clamped as integers, so that a NaN disparity gives a NaN loss instead of an error here.
@@ -260,14 +262,14 @@ def _places(columns: Float[Tensor, "b 1 h w"]) -> Int64[Tensor, " n"]:
 def upsample_convex(
     x: Float[Tensor, "b 1 h w"], weights: Float[Tensor, "b k h w"]
 ) -> Float[Tensor, "b 1 h2 w2"]:
-    """Upsample by two: each new pixel is a convex combination of old ones (RAFT, Teed & Deng 2020).
+    """Upsample by two, making each new pixel a convex combination of old pixels (RAFT, Teed & Deng 2020).
 
-    `weights` holds one logit per old and new pixel: [B, 9 * 4, H, W] combines the surrounding 3x3 old pixels,
-    [B, 4 * 4, H, W] the 2x2 old pixels whose centres enclose the new one. The combination can place a sharp
-    edge anywhere between two old pixels.
+    `weights` holds one logit for each combination of an old and a new pixel. If it is [B, 9 * 4, H, W], each
+    new pixel combines the surrounding 3x3 old pixels; if it is [B, 4 * 4, H, W], it combines the 2x2 old
+    pixels whose centres enclose it. The combination can place a sharp edge anywhere between two old pixels.
 
     Deviation: the weights are normalised sigmoids, because RAFT's softmax takes longer in ONNX Runtime than
-    all convolutions.
+    all convolutions together.
     """
     neighbours, logits = _neighbours(x, weights)
     shares = logits.sigmoid() + _LEAST_SHARE
@@ -279,21 +281,22 @@ def upsample_to_a_side(
 ) -> Float[Tensor, "b 1 h2 w2"]:
     """Upsample like `upsample_convex`, but snap a mixture of two surfaces to the one with the larger share.
 
-    The neighbours are split at the mixture into two sides, which count as two surfaces if their means are
-    more than `step` apart. The mean of two surfaces lies on neither and would be a flying pixel. All
-    thresholds are soft, so rounding errors cannot flip the result; a share of three quarters snaps fully.
-    Unsuitable for training, because the losing side gets hardly any gradient.
+    The neighbours are split into those above and those below the mixture. They count as two surfaces if the
+    means of the two sides are more than `step` apart. The mean of two surfaces lies on neither and would be a
+    flying pixel. All thresholds are soft, so rounding errors cannot flip the result; a side with a share of
+    at least three quarters is selected completely. The function is unsuitable for training, because the
+    losing side gets hardly any gradient.
     """
     neighbours, logits = _neighbours(x, weights)
-    # The sigmoid is written out, because ONNX Runtime's own has an error of 1e-7, too much where all
-    # neighbours are rejected. The gradient of this form is NaN below a logit of -88, so training uses
+    # The sigmoid is written out, because ONNX Runtime's own has an error of 1e-7, which is too large where
+    # all neighbours are rejected. The gradient of this form is NaN below a logit of -88, so training uses
     # PyTorch's sigmoid.
     shares = (1 + (-logits).exp()).reciprocal() + _LEAST_SHARE
     share, total = shares.sum(1), (shares * neighbours).sum(1)
     mixed = total / share
     above = shares * (neighbours - (mixed - 0.5).unsqueeze(1)).clamp(0, 1)
     share_above, total_above = above.sum(1), (above * neighbours).sum(1)
-    # 1e-6 avoids division by zero: if all neighbours are far above or far below, the other side is empty.
+    # 1e-6 avoids a division by zero if one side is empty.
     mean_above = total_above / (share_above + 1e-6)
     mean_below = (total - total_above) / (share - share_above + 1e-6)
     belongs_above = (2 * share_above / share - 0.5).clamp(0, 1)
@@ -303,9 +306,10 @@ def upsample_to_a_side(
 
 
 def _neighbours(x: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the old pixels around each new one, and the logits of their weights.
+    """Return the old pixels around each new pixel, and the logits of their weights.
 
-    Shapes are [B, 9, 1, H, W] and [B, 9, 4, H, W] for nine neighbours, twice [B, 4, 4, H, W] for four.
+    The shapes are [B, 9, 1, H, W] and [B, 9, 4, H, W] for nine neighbours. For four neighbours, both shapes
+    are [B, 4, 4, H, W].
     """
     batch, channels, height, width = weights.shape
     around = F.pad(x, (1, 1, 1, 1), mode="replicate")
@@ -313,7 +317,7 @@ def _neighbours(x: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
     if channels == 9 * 4:
         neighbours = torch.stack(shifted, 1)
     else:
-        # Old pixel (a, b) of the enclosing 2x2, for new pixel (i, j) of the 2x2 that replace one old pixel.
+        # Old pixel (a, b) of the enclosing 2x2, for new pixel (i, j) of the 2x2 that replace an old pixel.
         corners = [(0, 0), (0, 1), (1, 0), (1, 1)]
         neighbours = torch.cat([shifted[3 * (i + a) + j + b] for a, b in corners for i, j in corners], 1)
         neighbours = neighbours.view(batch, 4, 4, height, width)
@@ -324,8 +328,8 @@ def pad_to_multiple(image: Float[Tensor, "b c h w"], multiple: int) -> Float[Ten
     """Pad the image by repeating its last row and column until both sides are multiples of `multiple`.
 
     Padding is added below and on the right, so pixels keep their coordinates; crop results to
-    [..., :height, :width]. An image that fits is returned unchanged, so an exported graph whose sides are
-    declared as multiples contains no padding.
+    [..., :height, :width]. An image that needs no padding is returned unchanged, so an exported graph whose
+    sides are declared as multiples contains no padding.
     """
     below, behind = (-side % multiple for side in image.shape[2:])
     if below == behind == 0:
@@ -334,7 +338,7 @@ def pad_to_multiple(image: Float[Tensor, "b c h w"], multiple: int) -> Float[Ten
 
 
 class NormReluConv(nn.Sequential):
-    """Batch norm, ReLU, then convolution, as in DenseMapNet and the paper, at the input's resolution."""
+    """Batch norm, ReLU and convolution, in this order, at the input's resolution."""
 
     def __init__(self, inputs: int, outputs: int, kernel: int = 5, dilation: int = 1) -> None:
         super().__init__(
@@ -343,12 +347,13 @@ class NormReluConv(nn.Sequential):
 
 
 class PooledMatching(nn.Module):
-    """DenseMapNet's correspondence network, also used in the paper, over both views stacked and pooled by 8.
+    """DenseMapNet's correspondence network, which is also part of the paper's network.
 
-    Layers are registered in the order in which Keras numbers them in DenseMapNet's published weights.
+    It matches the two views after stacking them and pooling by 8. Layers are registered in the order in which
+    Keras numbers them in DenseMapNet's published weights.
 
     Args:
-        channels: Channels per view.
+        channels: Number of channels per view.
     """
 
     def __init__(self, channels: int = 3) -> None:
@@ -368,11 +373,11 @@ class PooledMatching(nn.Module):
     def forward(
         self, left: Float[Tensor, "b c h w"], right: Float[Tensor, "b c h w"]
     ) -> tuple[Float[Tensor, "b 32 h8 w8"], Float[Tensor, "b 16 h w"], Float[Tensor, "b 1 h w"]]:
-        """Return matches at 1/8 resolution, and the left view's features and single-channel map."""
+        """Return the matches at 1/8 resolution, the left view's features, and its single-channel map."""
         features = self.left_features(left)
         stereo = self.stereo_features(torch.cat([left, right], 1))
         stereo = F.relu(self.norm(F.max_pool2d(stereo, 8)))
-        # Widest dilation first: the order of channels in the published weights.
+        # The widest dilation comes first, as in the channels of the published weights.
         found = [self.dropout(conv(stereo)) for conv in reversed(self.correspondence)]
         matches = torch.cat([F.max_pool2d(features, 8), *found, stereo], 1)
         for block in self.dense:
@@ -381,9 +386,9 @@ class PooledMatching(nn.Module):
 
 
 class CodeHead(nn.Module):
-    """Head of DenseMapNet and the paper's network, which predicts a code in 0..1.
+    """Head of DenseMapNet and of the paper's network; it predicts a code in 0..1.
 
-    Its inputs are the decoded maps and the left view's one-channel map.
+    Its inputs are the decoded maps and the left view's single-channel map.
     """
 
     def __init__(self, inputs: int) -> None:
@@ -413,9 +418,9 @@ def keras_norm(channels: int) -> nn.BatchNorm2d:
 def initialise_as_keras(network: nn.Module) -> None:
     """Initialise every convolution with Glorot-uniform weights and zero biases, Keras's defaults.
 
-    PyTorch's default would start a transposed convolution to one channel with weights more than twice as
-    large. The logits of the following sigmoid would have a standard deviation of 2 instead of 0.8, as
-    measured.
+    With PyTorch's default, a transposed convolution to one channel would start with weights more than twice
+    as large. The logits of the following sigmoid would have a standard deviation of 2 instead of 0.8
+    (measured).
     """
     for layer in network.modules():
         if isinstance(layer, nn.Conv2d | nn.ConvTranspose2d):

@@ -4,18 +4,20 @@ J.-R. Chang and Y.-S. Chen, Pyramid Stereo Matching Network, CVPR 2018, arXiv:18
 
 Deviations, and choices where the paper is silent:
 
-- The feature extractor's batch norms see both views in one batch. This is faster than two batches, gives
-  shared weights shared statistics, and allows batches of a single pair where pooling leaves one pixel per
+- The feature extractor processes both views in one batch. This is faster than two batches, gives the shared
+  weights shared batch norm statistics, and allows batches of a single pair where pooling leaves one pixel per
   map.
 - Pooling windows are limited to the size of the map, so that small crops can be used in training.
-- The pyramid's branches have 1x1 kernels, as in the paper's text; with the 3x3 ones of its table the
-  parameter count would exceed the published one by 131,072.
+- The pyramid's branches have 1x1 kernels, as in the paper's text. With the 3x3 kernels in its table, the
+  number of parameters would be 131,072 larger than published.
 - Right features are 0 where the candidate is outside the right image; left features are kept.
-- Colours are scaled to -1..1 instead of by a dataset's mean and deviation, because a batch norm follows.
+- Colours are scaled to -1..1 rather than normalised with a dataset's mean and standard deviation, because a
+  batch norm follows.
 - Upsampling treats pixels as areas (align_corners=False). This places cost level k at candidate 4 k + 1.5,
-  while the cost volume shifts level k by exactly 4 k px: a sharp minimum at level 10 gives 41.5 px, not 40.
-  Training absorbs the 1.5 px except at the low end of the range: the first two candidates always have equal
-  costs, so no estimate is below 0.5 px, and disparities under about 1.5 px are inaccurate.
+  while the cost volume shifts level k by exactly 4 k px. A sharp minimum at level 10 therefore gives 41.5 px
+  instead of 40 px. Training compensates for the 1.5 px except at the low end of the range, where the first
+  two candidates always have equal costs. No estimate is therefore below 0.5 px, and disparities below about
+  1.5 px are inaccurate.
 """
 
 from typing import ClassVar, Literal
@@ -30,7 +32,7 @@ from stereoweave.learn.models.layers import ConvBlock, pad_to_multiple
 
 
 def norm_convolution(inputs: int, outputs: int, kernel: int, stride: int, dilation: int) -> nn.Sequential:
-    """Build a convolution and a batch norm, at 1 / `stride` of the input's resolution."""
+    """Build a convolution with the given stride and dilation, followed by a batch norm."""
     padding = dilation * (kernel // 2)
     return nn.Sequential(
         nn.Conv2d(inputs, outputs, kernel, stride, padding, dilation, bias=False), nn.BatchNorm2d(outputs)
@@ -38,14 +40,14 @@ def norm_convolution(inputs: int, outputs: int, kernel: int, stride: int, dilati
 
 
 def norm_convolution_3d(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
-    """Build a 3x3x3 convolution and a batch norm, at 1 / `stride` of the resolution in each dimension."""
+    """Build a 3x3x3 convolution with the given stride, followed by a batch norm."""
     return nn.Sequential(
         nn.Conv3d(inputs, outputs, 3, stride, padding=1, bias=False), nn.BatchNorm3d(outputs)
     )
 
 
 def norm_expansion_3d(inputs: int, outputs: int) -> nn.Sequential:
-    """Build a 3x3x3 transposed convolution and a batch norm, at twice the resolution in each dimension."""
+    """Build a 3x3x3 transposed convolution that doubles the resolution, followed by a batch norm."""
     return nn.Sequential(
         nn.ConvTranspose3d(inputs, outputs, 3, stride=2, padding=1, output_padding=1, bias=False),
         nn.BatchNorm3d(outputs),
@@ -72,7 +74,7 @@ class BasicBlock(nn.Module):
 def stack_basic_blocks(
     inputs: int, outputs: int, count: int, stride: int = 1, dilation: int = 1
 ) -> nn.Sequential:
-    """Stack `count` basic blocks; the first one changes channels and resolution."""
+    """Stack `count` basic blocks; the first block changes the number of channels and the resolution."""
     rest = (BasicBlock(outputs, outputs, dilation=dilation) for _ in range(count - 1))
     return nn.Sequential(BasicBlock(inputs, outputs, stride, dilation), *rest)
 
@@ -94,7 +96,7 @@ class PyramidPooling(nn.Module):
 
 
 class PSMFeatures(nn.Module):
-    """Features of a view with multi-scale context, at a quarter of its resolution [B, 32, H/4, W/4]."""
+    """Feature extractor with multi-scale context, which returns maps [B, 32, H/4, W/4] of a view."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -120,10 +122,11 @@ class PSMFeatures(nn.Module):
 def cost_volume(
     left: Float[Tensor, "b c h w"], right: Float[Tensor, "b c h w"], levels: int
 ) -> Float[Tensor, "b c2 d h w"]:
-    """Join features of column x of `left` and column x - d of `right`, d = 0 .. levels - 1; 0 outside.
+    """Concatenate the features of column x of `left` and column x - d of `right`, for d = 0 .. levels - 1.
 
-    A window as wide as the image slides over the right view, which is zero-padded on the left; d is 0 in its
-    last position. Plain reference: `cost_volume_plain` in tests/learn/models/test_psmnet.py.
+    Right features are 0 if column x - d is outside the map. A window as wide as the map slides over the right
+    features, which are zero-padded on the left; in the window's last position, d is 0. The plain reference is
+    `cost_volume_plain` in tests/learn/models/test_psmnet.py.
     """
     windows = F.pad(right, (levels - 1, 0)).unfold(3, right.shape[3], 1)
     shifted = windows.flip(3).transpose(2, 3)
@@ -134,11 +137,11 @@ def soft_argmin(cost: Float[Tensor, "b d h w"]) -> Float[Tensor, "b 1 h w"]:
     """Return the expected disparity under a softmax over matching costs (Kendall et al. 2017).
 
     Args:
-        cost: Matching cost per candidate [B, D, H, W]; low is good. Candidate i means a disparity of i pixels
-            at this resolution.
+        cost: Matching cost per candidate [B, D, H, W]; lower costs are better. Candidate i is a disparity of
+            i pixels at this resolution.
 
     Returns:
-        Disparity [B, 1, H, W] in pixels: column x of the left image is at x - disparity in the right.
+        Disparity [B, 1, H, W] in pixels: left column x corresponds to right column x - disparity.
     """
     candidates_px = torch.arange(cost.shape[1], dtype=cost.dtype, device=cost.device).view(1, -1, 1, 1)
     return ((-cost).softmax(1) * candidates_px).sum(1, keepdim=True)
@@ -167,10 +170,11 @@ class Hourglass(nn.Module):
         way_down: Float[Tensor, "b 64 d2 h2 w2"] | None,
         way_up: Float[Tensor, "b 64 d2 h2 w2"] | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return a correction of the volume [B, 32, D, H, W], and the maps on the way down and up.
+        """Return a correction to the volume [B, 32, D, H, W], the encoder's maps, and the decoder's maps.
 
-        The maps on the way down and up are at half resolution. `way_down` is from the first hourglass,
-        `way_up` from the previous one; both are None in the first.
+        The maps of the encoder and the decoder are at half resolution. `way_down` holds the encoder's maps of
+        the first hourglass, and `way_up` the decoder's maps of the previous hourglass. Both are None in the
+        first hourglass.
         """
         down = self.down(x)
         here = F.relu(down if way_up is None else down + way_up)
@@ -181,12 +185,12 @@ class Hourglass(nn.Module):
 class PSMNet(nn.Module):
     """Network that estimates the left view's disparity as the mean of a distribution over candidates.
 
-    Estimates are between 0.5 and `max_disparity_px` - 1.5. 5,224,768 parameters; 432.88 G multiply-adds at
-    640x480 with 192 candidates. The count covers only convolutions, not batch norm, pooling, upsampling of
-    the costs and softmax.
+    Estimates are between 0.5 px and `max_disparity_px` - 1.5 px. The network has 5,224,768 parameters and
+    takes 432.88 G multiply-adds at 640x480 with 192 candidates. The multiply-adds include only convolutions,
+    not batch norm, pooling, upsampling or softmax.
 
     Args:
-        max_disparity_px: Number of candidates, a multiple of 16.
+        max_disparity_px: Number of candidate disparities, a multiple of 16.
     """
 
     multiple_of = 16
@@ -197,7 +201,7 @@ class PSMNet(nn.Module):
         super().__init__()
         if max_disparity_px < 16 or max_disparity_px % 16:
             raise StereoweaveError(
-                f"PSMNet: max_disparity_px: expected a multiple of 16 above 0, found {max_disparity_px}"
+                f"PSMNet: max_disparity_px: expected a positive multiple of 16, found {max_disparity_px}"
             )
         self.max_disparity_px = max_disparity_px
         self.features = PSMFeatures()
@@ -217,7 +221,7 @@ class PSMNet(nn.Module):
     def compute_costs(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
     ) -> list[Float[Tensor, "b 1 d4 h4 w4"]]:
-        """Return matching costs after each hourglass, for 1/4 of the candidates at 1/4 of the padded size."""
+        """Return the matching costs after each hourglass, for every fourth candidate at 1/4 resolution."""
         views = pad_to_multiple(torch.cat([left, right]), self.multiple_of)
         left_features, right_features = self.features(views).chunk(2)
         narrowed = self.narrow(cost_volume(left_features, right_features, self.max_disparity_px // 4))
@@ -234,13 +238,13 @@ class PSMNet(nn.Module):
     def outputs(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
     ) -> tuple[Float[Tensor, "b 1 h w"], ...]:
-        """Return the disparities in pixels after each hourglass; the last one is the estimate."""
+        """Return the disparity in pixels after each hourglass; the last one is the estimate."""
         return tuple(_disparity_px(cost, left) for cost in self.compute_costs(left, right))
 
     def forward(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
     ) -> Float[Tensor, "b 1 h w"]:
-        """Return the disparity of the left view in pixels, from RGB images in 0..1."""
+        """Return the left view's disparity in pixels, given RGB images in 0..1."""
         return _disparity_px(self.compute_costs(left, right)[-1], left)
 
 
@@ -253,17 +257,17 @@ def _make_head() -> nn.Sequential:
 def _disparity_px(
     cost: Float[Tensor, "b 1 d4 h4 w4"], image: Float[Tensor, "b 3 h w"]
 ) -> Float[Tensor, "b 1 h w"]:
-    """Return the disparity at the size of `image`, from costs at a quarter of its padded size.
+    """Return a disparity map of the same size as `image`, given costs at a quarter of the padded size.
 
-    Level k of the costs is placed at candidate 4 k + 1.5; see the deviations above. Costs of any type are
-    converted to float32, because bfloat16 has no fractions between 128 and 256.
+    Level k of the costs is placed at candidate 4 k + 1.5, a deviation that the module's docstring explains.
+    Costs of any type are converted to float32, because bfloat16 has no fractions between 128 and 256.
     """
     full = F.interpolate(cost.float(), scale_factor=4.0, mode="trilinear").squeeze(1)
     return soft_argmin(full)[..., : image.shape[2], : image.shape[3]]
 
 
 def _initialise(layer: nn.Module) -> None:
-    """Draw normal weights of variance 2 / (kernel volume * outputs), as published."""
+    """Draw weights from a normal distribution of variance 2 / (kernel volume * outputs), as published."""
     if isinstance(layer, nn.Conv2d | nn.Conv3d):
         nn.init.kaiming_normal_(layer.weight, mode="fan_out", nonlinearity="relu")
     elif isinstance(layer, nn.ConvTranspose3d):

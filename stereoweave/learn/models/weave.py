@@ -1,8 +1,9 @@
-"""WeaveNet: the paper's dilated dense blocks and stepwise decoder around a correlation of shared features.
+"""WeaveNet: a correlation of encoder features, with the paper's dilated dense blocks and stepwise decoder.
 
-The paper matches by convolutions over both views, stacked and pooled by 8, which ties the learned matching to
-the training pictures. WeaveNet instead correlates features of one shared encoder. It keeps the paper's
-dilated, densely connected blocks, the decoder in steps of two, and the skip connections from the image.
+The paper's network matches with convolutions over both views, stacked and pooled by 8. This ties the learned
+matching to the training images. WeaveNet instead correlates the features that one encoder extracts from each
+view. It keeps the paper's dilated, densely connected blocks, the decoder that upsamples in steps of two, and
+the skip connections from the image.
 """
 
 from dataclasses import dataclass, replace
@@ -33,28 +34,31 @@ from stereoweave.learn.models.weave_stages import Completion, Sharpening, WiderC
 
 @dataclass(frozen=True, kw_only=True)
 class WeaveSize:
-    """Sizes of a WeaveNet's parts. Tuples of four are for 1/2, 1/4, 1/8 and 1/16 of the resolution.
+    """Layer sizes of a WeaveNet. Tuples of four hold the values for 1/2, 1/4, 1/8 and 1/16 resolution.
 
     Attributes:
-        channels: Channels of the encoder's maps.
-        convolutions: Number of 3x3 convolutions of the encoder at each resolution, after the one that halves
-            it; an even number forms residual blocks.
-        dilations: Dilations of the dense blocks at 1/8.
-        growth: Channels that each dense block adds.
-        bottleneck: Output channels of the dense blocks.
-        context: Channels of the aggregation's context at 1/16.
-        join_kernel: Kernel of the last convolution before the correlation.
-        propagation: Channels of the blocks at 1/4 that spread confident disparities; 0 for none.
-        compared: Channels that are correlated at 1/2.
-        handed: Channels passed from the decoder to 1/2. ONNX Runtime is faster if the number of channels
-            joined there is a multiple of 4; BASE joins 29, like the network that it grew from.
-        warps: Whether the other view is warped once for the correlation at 1/2, instead of being gathered
-            for each offset.
-        refinement: Number of 3x3 convolutions at 1/2.
-        neighbours: Number of old pixels that an upsampled pixel combines, 9 or 4.
-        wider: Channels of the context at 1/32; 0 for none.
-        completion: Channels of the stage at 1/4 that completes occluded areas; 0 for none.
-        sharpening: Channels that are correlated at full resolution; 0 for none.
+        channels: Number of channels of the encoder's maps.
+        convolutions: Number of the encoder's 3x3 convolutions at each resolution, besides the convolution
+            that halves the resolution. Every two of them form a residual block.
+        dilations: Dilations of the dense blocks at 1/8 resolution.
+        growth: Number of channels that each dense block adds.
+        bottleneck: Number of output channels of the dense blocks.
+        context: Number of channels of the aggregation's context at 1/16 resolution.
+        join_kernel: Kernel size of the encoder's last convolution.
+        propagation: Number of channels of the blocks at 1/4 resolution that spread confident disparities; 0
+            omits these blocks.
+        compared: Number of channels that are correlated at 1/2 resolution.
+        handed: Number of channels passed from the decoder to the refinement at 1/2 resolution. ONNX Runtime
+            is faster if the refinement's number of input channels is a multiple of 4. BASE has 29, like the
+            network from which it was grown.
+        warps: Whether the other view is warped once for the correlation at 1/2 resolution, instead of being
+            sampled for each offset.
+        refinement: Number of 3x3 convolutions in the refinement at 1/2 resolution.
+        neighbours: Number of old pixels that are combined into an upsampled pixel, 9 or 4.
+        wider: Number of channels of the context at 1/32 resolution; 0 omits this context.
+        completion: Number of channels of the stage at 1/4 resolution that completes occluded areas; 0 omits
+            this stage.
+        sharpening: Number of channels that are correlated at full resolution; 0 omits the sharpening.
     """
 
     channels: tuple[int, int, int, int]
@@ -106,22 +110,24 @@ BASE = WeaveSize(
     neighbours=9,
 )
 
-# BASE with all optional stages, which change nothing until they are trained.
+# BASE with all optional stages, which do not change its output until they are trained.
 BASE_GROWN = replace(BASE, wider=64, completion=32, sharpening=8)
 
 
 @dataclass(frozen=True, kw_only=True)
 class WeaveStages:
-    """Every stage of a prediction, for the losses.
+    """Results of every stage of a prediction, for use by the losses.
 
     The batch holds the left views first, then the mirrored right views.
 
     Attributes:
-        correlation: Raw matching scores per level of 4 px at 1/4 resolution [2B, D, H/4, W/4].
-        scores: Matching scores after aggregation.
-        coarse_px: Disparity before the refinement, at half resolution, in full-resolution pixels.
+        correlation: Matching scores before aggregation, at 1/4 resolution, for each level of 4 px
+            [2B, D, H/4, W/4].
+        scores: Matching scores after aggregation, in the same format.
+        coarse_px: Disparity before the refinement, at half resolution but in full-resolution pixels
+            [2B, 1, H/2, W/2].
         disparity_px: Final disparity [2B, 1, H, W].
-        confidence_logit: Log odds that the disparity is within 1 px [2B, 1, H, W].
+        confidence_logit: Log odds that the disparity is within 1 px of the truth [2B, 1, H, W].
     """
 
     correlation: Float[Tensor, "b d h_d w_d"]
@@ -146,19 +152,22 @@ def as_left_view(views: Tensor, batch: int | torch.SymInt) -> Tensor:
 
 
 def as_other_view(views: Tensor, batch: int | torch.SymInt) -> Tensor:
-    """Return the counterparts of `as_left_view`: maps of the right views, then mirrored ones of the left."""
+    """Return the maps of the right views, then the mirrored maps of the left views."""
     return torch.cat([views[batch:], mirror(views[:batch])])
 
 
 def stack_convolutions(channels: int, count: int) -> list[nn.Module]:
-    """Make `count` 3x3 convolutions: a single one if the count is odd, then residual blocks of two."""
+    """Build `count` 3x3 convolutions: a single one first if the count is odd, then residual blocks of two."""
     alone: list[nn.Module] = [ConvBlock(channels, channels)] * (count % 2)
     residual = [Residual(channels) for _ in range(count // 2)]
     return alone + residual[:1] + [zero_initialise(block) for block in residual[1:]]
 
 
 class Encoder(nn.Module):
-    """Feature encoder of one view: down to 1/16, then up again, so that finer maps include context."""
+    """Feature encoder of one view.
+
+    It downsamples to 1/16 resolution and upsamples again, so that finer maps include context.
+    """
 
     def __init__(self, size: WeaveSize) -> None:
         super().__init__()
@@ -185,7 +194,7 @@ class Encoder(nn.Module):
 
 
 class Context(nn.Module):
-    """Context at 1/16, wide enough to reach the edges of textureless surfaces."""
+    """Context at 1/16 resolution, wide enough to reach the edges of textureless surfaces."""
 
     def __init__(self, inputs: int, sixteenth: int, size: WeaveSize) -> None:
         super().__init__()
@@ -204,7 +213,7 @@ class Context(nn.Module):
 
 
 class Aggregation(nn.Module):
-    """Aggregation of matching scores over their context by dilated dense blocks at 1/8, decoded to 1/4."""
+    """Aggregation of matching scores by dilated dense blocks at 1/8 resolution, with a decoder to 1/4."""
 
     def __init__(self, levels: int, size: WeaveSize) -> None:
         super().__init__()
@@ -218,7 +227,7 @@ class Aggregation(nn.Module):
         self.scores = nn.Conv2d(32, levels, 1)
 
     def forward(self, correlation: Tensor, features: WeaveFeatures) -> tuple[Tensor, Tensor]:
-        """Return scores [B, D, H/4, W/4] and the decoder's features [B, 32, H/4, W/4]."""
+        """Return the scores [B, D, H/4, W/4] and the decoder's features [B, 32, H/4, W/4]."""
         matches = torch.cat([correlation, features.quarter], 1)
         dense = self.dense(torch.cat([self.down(matches), features.eighth], 1))
         wide = self.bottleneck(dense) + self.context(dense, features.sixteenth)
@@ -227,7 +236,7 @@ class Aggregation(nn.Module):
 
 
 class Propagation(nn.Module):
-    """Correction of the disparity at 1/4, which smooths the disparity of smooth surfaces.
+    """Correction at 1/4 resolution that makes the disparity of smooth surfaces smoother.
 
     One of its inputs is the disparity's deviation from the local mean.
     """
@@ -240,7 +249,7 @@ class Propagation(nn.Module):
         self.decoded = zero_initialise(nn.Conv2d(channels, 32, 1))
 
     def forward(self, disparity: Tensor, quarter: Tensor, decoded: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the disparity in levels [B, 1, H/4, W/4] and the decoder's features."""
+        """Return the corrected disparity in levels [B, 1, H/4, W/4] and the corrected decoder features."""
         # In float32, because near a disparity of 100 px bfloat16 cannot resolve the slope of a surface.
         departure = disparity - F.avg_pool2d(disparity, 9, 1, 4, count_include_pad=False)
         x = self.body(self.join(torch.cat([decoded, quarter, departure, disparity / 16], 1)))
@@ -248,7 +257,7 @@ class Propagation(nn.Module):
 
 
 class Refinement(nn.Module):
-    """Correction by at most `radius` pixels at half resolution, from correlations around the estimate."""
+    """Correction of the disparity by at most `radius` half-resolution pixels, from correlations around it."""
 
     def __init__(self, size: WeaveSize, radius: int = 2) -> None:
         super().__init__()
@@ -264,7 +273,7 @@ class Refinement(nn.Module):
     def forward(
         self, disparity: Tensor, first: Tensor, second: Tensor, context: Tensor, decoded: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return disparity in pixels of this resolution, weights for upsampling, confidence and features."""
+        """Return disparity in half-resolution pixels, upsampling weights, confidence logits and features."""
         matches = self.matches(first, second, disparity, self.radius)
         x = self.body(self.join(torch.cat([matches, context, decoded], 1)))
         correction = expected_step((matches + self.scores(x)).float())
@@ -274,10 +283,14 @@ class Refinement(nn.Module):
 class WeaveNet(nn.Module):
     """Network that estimates the disparity of both views of a rectified pair, and the left view's confidence.
 
-    Sides must be multiples of 16, or of 32 with a context at 1/32. The disparity range is 0 to `levels` * 4 -
-    1 px. SMALL has 278,029 parameters and takes 2.96 G multiply-adds for both views at 640x480. BASE has
-    1,274,290 parameters and takes 13.41 G multiply-adds; BASE_GROWN has 1,470,020 parameters and takes
-    15.98 G multiply-adds.
+    The sides of the images must be multiples of 16, or of 32 if there is a context at 1/32 resolution. The
+    disparity range is 0 to `levels` * 4 - 1 px.
+
+    Size, and cost for both views at 640x480:
+
+    - SMALL: 278,029 parameters and 2.96 G multiply-adds
+    - BASE: 1,274,290 parameters and 13.41 G multiply-adds
+    - BASE_GROWN: 1,470,020 parameters and 15.98 G multiply-adds
     """
 
     def __init__(self, size: WeaveSize = SMALL, levels: int = 48) -> None:
@@ -307,8 +320,8 @@ class WeaveNet(nn.Module):
         return self.refinement.confidence, *sharpened
 
     def stages(self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]) -> WeaveStages:
-        """Return every stage of the prediction for both views."""
-        # No len() and no chunk(), here and below: they would fix the batch size on export.
+        """Return the results of every stage for both views."""
+        # Here and below, len() and chunk() are avoided, because they would fix the batch size on export.
         batch = left.shape[0]
         images = torch.cat([left, right])
         maps = self.encoder(images)
@@ -338,11 +351,11 @@ class WeaveNet(nn.Module):
         )
 
     def match(self, maps: WeaveFeatures, first: WeaveFeatures) -> tuple[Tensor, Tensor, Tensor]:
-        """Return matching scores before and after aggregation, and the decoder's features.
+        """Return the matching scores before and after aggregation, and the decoder's features.
 
         Args:
-            maps: Features of the left views, then of the right ones.
-            first: The same features `as_left_view`.
+            maps: Features of the left views, then of the right views.
+            first: The same features, arranged by `as_left_view`.
         """
         match = self.to_match(maps.quarter)
         batch = match.shape[0] // 2
@@ -350,11 +363,11 @@ class WeaveNet(nn.Module):
         return correlation, *self.aggregation(correlation, first)
 
     def upsample(self, x: Tensor, weights: Tensor) -> Tensor:
-        """Upsample by two, guided by `weights`; sharper at inference, when no gradient is needed."""
+        """Upsample `x` by two with `weights`; edges are sharper at inference, when no gradient is needed."""
         return upsample_convex(x, weights) if self.training else upsample_to_a_side(x, weights)
 
     def read_disparity(self, scores: Tensor, decoded: Tensor) -> Tensor:
-        """Return disparity in pixels at 1/4 resolution; coarser variants also use the decoder's features."""
+        """Return the disparity in quarter-resolution pixels; subclasses may also use `decoded`."""
         return local_soft_argmax(scores)
 
     def _propagate(
@@ -385,7 +398,7 @@ class WeaveNet(nn.Module):
         return sharp_px, logit + more
 
     def forward(self, left: Tensor, right: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return left disparity, right disparity and the left view's confidence logit, each [B, 1, H, W]."""
+        """Return both views' disparities and the left view's confidence logit, each [B, 1, H, W]."""
         stages, batch = self.stages(left, right), left.shape[0]
         # Noise at infinity has both signs, but parallel cameras have no negative disparities.
         disparity_px = stages.disparity_px.clamp(min=0)

@@ -1,4 +1,4 @@
-"""Optional stages that can be added to a trained WeaveNet; they change nothing until they are trained."""
+"""Optional stages for a trained WeaveNet; they do not change its output until they are trained."""
 
 import torch
 import torch.nn.functional as F
@@ -16,19 +16,19 @@ from stereoweave.learn.models.layers import (
     zero_initialise,
 )
 
-# Offsets (rows, columns) at which the completion looks for the background, in pixels of 1/4 resolution.
+# Offsets (rows, columns) at which the completion looks for the background, in quarter-resolution pixels.
 OFFSETS = tuple(
     (sign * step * down, sign * step * along)
     for down, along, steps in ((0, 1, (2, 4, 8, 16, 32)), (1, 0, (2, 4, 8, 16)))
     for step in steps
     for sign in (-1, 1)
 )
-# Left-right differences are clamped to this magnitude, in pixels of 1/4 resolution.
+# Left-right differences are clamped to this magnitude, in quarter-resolution pixels.
 _LARGEST_CHECK = 4.0
 
 
 class WiderContext(nn.Module):
-    """Context at 1/32, added to the context at 1/16."""
+    """Context at 1/32 resolution, added to the context at 1/16 resolution."""
 
     def __init__(self, channels: int, wider: int) -> None:
         super().__init__()
@@ -41,12 +41,12 @@ class WiderContext(nn.Module):
 
 
 class Completion(nn.Module):
-    """Completion of the disparity at 1/4 from its surroundings where the two views disagree.
+    """Completion of the disparity at 1/4 resolution where the two views disagree.
 
-    An occluded pixel has no match. The left-right check finds such pixels, and each takes a convex
-    combination of disparities 2 to 32 pixels away in its row and column. The weights are learned affinities,
-    as in spatial propagation networks (Liu et al., NeurIPS 2017), but with fixed, distant offsets instead of
-    repeated steps.
+    An occluded pixel has no match. The left-right check finds such pixels, and each is assigned a convex
+    combination of the disparities 2 to 32 pixels away in its row and column. The weights are learned
+    affinities, as in spatial propagation networks (Liu et al., NeurIPS 2017), but with fixed, distant offsets
+    instead of repeated steps.
     """
 
     def __init__(self, quarter: int, channels: int) -> None:
@@ -64,10 +64,10 @@ class Completion(nn.Module):
         quarter: Float[Tensor, "b c h w"],
         decoded: Float[Tensor, "b 32 h w"],
     ) -> tuple[Tensor, Tensor]:
-        """Return the completed disparity in pixels of 1/4 resolution, and the decoder's features.
+        """Return the completed disparity in quarter-resolution pixels, and the updated decoder features.
 
         Args:
-            disparity: Disparity in pixels of 1/4 resolution.
+            disparity: Disparity in quarter-resolution pixels.
             other: The other view's disparity, in that view's own columns.
             quarter: The encoder's features.
             decoded: The decoder's features.
@@ -81,7 +81,7 @@ class Completion(nn.Module):
         return disparity + share * (mixed - disparity), decoded + self.decoded(x)
 
     def _checks(self, disparity: Tensor, other: Tensor) -> tuple[Tensor, ...]:
-        """Return cues for occlusion: deviation from the mean, disparity, left-right check, border check."""
+        """Return occlusion cues: deviation from the mean, disparity, left-right check and border check."""
         columns = torch.arange(disparity.shape[3], dtype=torch.float32, device=disparity.device)
         # In float32, because near a disparity of 100 px bfloat16 cannot resolve the slope of a surface.
         departure = disparity - F.avg_pool2d(disparity, 9, 1, 4, count_include_pad=False)
@@ -91,7 +91,7 @@ class Completion(nn.Module):
 
 
 class Sharpening(nn.Module):
-    """Correction by at most `radius` pixels at full resolution, from correlations around the estimate."""
+    """Correction of the disparity by at most `radius` full-resolution pixels, from correlations around it."""
 
     def __init__(self, handed: int, inputs: int, channels: int, radius: int = 2) -> None:
         super().__init__()
@@ -107,17 +107,17 @@ class Sharpening(nn.Module):
         self.confidence = zero_initialise(nn.Conv2d(16, 1, 1))
 
     def views(self, images: Float[Tensor, "b 3 h w"]) -> tuple[Tensor, Tensor]:
-        """Return the features of the images, and the maps to correlate."""
+        """Return the features of the images and the maps to correlate."""
         features = self.features(images * 2 - 1)
         return features, self.to_match(features)
 
     def forward(
         self, disparity: Tensor, first: Tensor, second: Tensor, features: Tensor, context: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return the corrected disparity in pixels, and the change of the confidence logit.
+        """Return the corrected disparity in pixels, and the change in the confidence logit.
 
         Args:
-            disparity: Disparity in pixels of full resolution.
+            disparity: Disparity in full-resolution pixels.
             first: This view's maps to correlate.
             second: The other view's maps to correlate.
             features: This view's features.

@@ -149,7 +149,7 @@ def test_a_batch_with_one_sample_without_a_camera_has_no_cameras():
 def test_a_batch_of_mixed_sizes_is_refused():
     mixed = [box_before_a_wall(np.random.default_rng(0), size) for size in ((64, 96), (32, 48), (64, 96))]
     assert complaint(collate, mixed) == (
-        "batch: expected pairs of one size, found 48x32 and 96x64; crop them to the same crop_size"
+        "batch: expected pairs of the same size, found 48x32 and 96x64; crop them to the same crop_size"
     )
 
 
@@ -158,7 +158,7 @@ def test_the_error_for_a_pair_without_a_known_pixel_names_it():
     pairs = Listed([*samples(2), *samples(1, disparity_px=unknown_px)])
     assert read_known(pairs, 1) is pairs[1]
     assert complaint(read_known, pairs, 2) == (
-        "sample 2: expected at least one pixel of known disparity, found none; "
+        "sample 2: expected at least one pixel with known disparity, found none; "
         "remove the pair from the dataset"
     )
     batches = Batches(replace(RECIPE, batch=3), pairs)

@@ -114,7 +114,9 @@ def test_all_held_out_frames_are_returned_on_request(recipe, tmp_path):
 
 def test_the_error_for_an_unknown_dataset_lists_the_known_ones(recipe, tmp_path):
     message = complaint(open_sources, replace(recipe, dataset="propeller"), tmp_path)
-    assert message.startswith("tiny: dataset = 'propeller', expected collage or sintel, flyingthings3d, ")
+    assert message.startswith(
+        "tiny: dataset = 'propeller', expected one of collage, sintel, flyingthings3d, "
+    )
 
 
 def test_the_error_for_a_missing_root_names_it(recipe, tmp_path):
@@ -172,8 +174,8 @@ def test_a_mix_without_collages_makes_no_training_collages(rendered, tmp_path):
 
 def test_the_error_for_a_missing_set_of_a_mix_names_it(rendered, tmp_path):
     assert complaint(open_sources, mixed(rendered, caves=1.0), tmp_path) == (
-        f"tiny: mix: {rendered}/caves: expected pairs of `stereoweave synth make`, or folders of such pairs, "
-        "found none; render them first"
+        f"tiny: mix: {rendered}/caves: expected pairs made by `stereoweave synth make` or folders of such "
+        "pairs, found none; render them first"
     )
 
 
@@ -206,4 +208,6 @@ def test_held_out_sets_are_read_from_their_folders(rendered):
 
 def test_the_error_for_a_missing_held_out_set_names_it(tmp_path):
     message = complaint(open_held_out_sets, replace(RECIPE, held_out=(("rooms", str(tmp_path / "rooms")),)))
-    assert message.startswith(f"tiny: held_out: {tmp_path / 'rooms'}: expected pairs of `stereoweave synth")
+    assert message.startswith(
+        f"tiny: held_out: {tmp_path / 'rooms'}: expected pairs made by `stereoweave synth"
+    )

@@ -32,7 +32,7 @@ def test_variants_are_made_from_a_shipped_network(tmp_path, monkeypatch, capsys)
     ("arguments", "told"),
     [
         ("export small", "expected an output file, found none"),
-        ("export small -o out.trt", "out.trt: expected a name that ends in .onnx"),
+        ("export small -o out.trt", "out.trt: expected the file extension .onnx, found .trt"),
         ("export small -o a.onnx --half a.onnx", "a.onnx: expected a different file"),
         ("export small -o a.onnx --size 640", "such as 640x480, found '640'"),
         (
@@ -72,5 +72,8 @@ def test_an_export_does_not_overwrite_its_source(tmp_path, monkeypatch, capsys, 
     monkeypatch.chdir(tmp_path)
     shutil.copyfile(model_file("small"), "mine.onnx")
     assert cli.main(["export", "mine.onnx", option, str(tmp_path / "mine.onnx")]) == 2
-    assert "mine.onnx: expected an output file other than the source" in capsys.readouterr().err
+    assert (
+        "mine.onnx: expected an output file other than the source, found the source itself"
+        in capsys.readouterr().err
+    )
     assert Path("mine.onnx").read_bytes() == model_file("small").read_bytes()

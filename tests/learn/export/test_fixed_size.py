@@ -65,4 +65,4 @@ def test_a_size_that_the_network_cannot_take_is_refused(tmp_path, width, height,
 
 def test_a_file_for_one_size_cannot_be_converted_to_another_size(fixed, tmp_path):
     message = complaint(fixed_size.fix_size, fixed, tmp_path / "out.onnx", 128, 64)
-    assert message.endswith("found one for 96x64 only; use the file that it was made from")
+    assert message.endswith("found one for 96x64 only; use the file from which it was made")

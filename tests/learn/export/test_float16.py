@@ -62,7 +62,7 @@ def test_a_float16_file_is_half_as_large_and_its_card_has_the_small_difference(s
 
     # A variant cannot be the source of another one.
     message = complaint(halve.convert_to_float16, out, tmp_path / "again.onnx")
-    assert message.endswith("found one in 16 bits; use the file that it was made from")
+    assert message.endswith("found one in float16; use the file from which it was made")
 
 
 def test_only_convolutions_and_products_have_weights_of_16_bits():
@@ -77,6 +77,6 @@ def test_only_convolutions_and_products_have_weights_of_16_bits():
 def test_nothing_is_written_if_16_bits_change_disparity_too_much(small_pairs, tmp_path, monkeypatch):
     monkeypatch.setattr(halve, "LARGEST_MEAN_DIFFERENCE_PX", 0.0)
     message = complaint(halve.convert_to_float16, SMALL, tmp_path / "small16.onnx")
-    assert "expected 16 bits to change disparity by less than 0.0 px on average, found 0.0" in message
+    assert "expected float16 to change disparity by less than 0.0 px on average, found 0.0" in message
     assert message.endswith(" px; nothing was written")
     assert list(tmp_path.iterdir()) == []

@@ -100,7 +100,8 @@ def test_the_matcher_file_answers_as_pytorch_does_and_nothing_is_written_otherwi
     monkeypatch.setattr(export, "export_graph", lambda _network, _kept: of_another_network(graph))
     elsewhere = tmp_path / "elsewhere" / "tiny.onnx"
     with pytest.raises(
-        StereoweaveError, match=r"run.*: ONNX Runtime and PyTorch differ by .* nothing was written"
+        StereoweaveError,
+        match=r"run.*: expected ONNX Runtime and PyTorch to differ by .* nothing was written",
     ):
         export.export_matcher(run / "last.pt", elsewhere, [pair])
     assert list(elsewhere.parent.iterdir()) == []
@@ -158,7 +159,7 @@ def test_a_network_that_estimates_depth_cannot_be_exported(tmp_path):
     checkpoint.save(checkpoint_of(untrained("fast_depth"), recipe), tmp_path / "last.pt")
     assert complaint(export.export_matcher, tmp_path, tmp_path / "out" / "depth.onnx") == (
         "tiny: expected target = 'disparity', found 'depth'; "
-        "a matcher file has no camera to convert depth to disparity"
+        "a matcher file has no camera with which to convert depth to disparity"
     )
     assert not (tmp_path / "out").exists()
 

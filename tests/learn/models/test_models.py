@@ -149,6 +149,6 @@ def test_the_error_for_an_unknown_network_lists_the_known_ones():
     with pytest.raises(FormatError) as caught:
         build_network(recipe_of("spider"))
     assert str(caught.value) == (
-        "tiny: model = 'spider', expected weave_small or weave_base or weave_base_grown or fast_depth "
-        "or fast_depth_without_skips or densemapnet or dispnet or psmnet"
+        "tiny: model = 'spider', expected one of weave_small, weave_base, weave_base_grown, fast_depth, "
+        "fast_depth_without_skips, densemapnet, dispnet, psmnet"
     )

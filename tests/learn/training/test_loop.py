@@ -241,7 +241,7 @@ def test_a_pair_that_cannot_be_trained_on_is_named_in_one_line(tmp_path):
     changes = {"dataset": "paper", "root": str(tmp_path / "set"), "crop_size": (32, 32), "batch": 1}
     file = write(recipe_of("fast_depth", **changes), tmp_path / "unknown.toml")
     message = complaint(train, file, tmp_path / "run", QUIET)
-    assert re.fullmatch(r"[ab]: expected at least one pixel of known disparity, found none; .*", message)
+    assert re.fullmatch(r"[ab]: expected at least one pixel with known disparity, found none; .*", message)
 
 
 def test_a_truth_out_of_range_is_named_with_the_pairs_of_its_step(tmp_path, logger):
@@ -286,7 +286,7 @@ def test_gradients_that_are_not_finite_never_reach_the_weights_and_the_second_st
 
 def test_a_recipe_for_an_unknown_network_is_refused(tmp_path):
     file = write(replace(RECIPE, model="spider"), tmp_path / "spider.toml")
-    with pytest.raises(FormatError, match=r"tiny: model = 'spider', expected weave_small"):
+    with pytest.raises(FormatError, match=r"tiny: model = 'spider', expected one of weave_small"):
         train(file, tmp_path / "run", QUIET)
 
 
