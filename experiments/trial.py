@@ -1,4 +1,4 @@
-"""One training among those of an experiment."""
+"""Description of one training of an experiment."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ class Trial:
 
     Attributes:
         claim: Claim or design choice that the training tests.
-        setting: Name of the training among those of the claim.
+        setting: Name of the training, unique within its claim.
         recipe: Everything that the training depends on.
     """
 

@@ -18,8 +18,7 @@ def ablations(
         Path,
         typer.Option(
             help="CSV file to write, with one row per training. Rows of the same recipe are reused, and "
-            "others "
-            "dropped; remove the file after a change of the code."
+            "other rows are dropped; remove the file after a change of the code."
         ),
     ],
     rendered: Annotated[

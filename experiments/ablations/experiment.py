@@ -60,7 +60,7 @@ _CPU = torch.device("cpu")
 
 
 def plan(base: Recipe, seeds: int) -> list[Trial]:
-    """Return trials of all variations with the first seed, then the next. Recipes are named after both."""
+    """Return trials of all variations with the first seed, then with each further seed."""
     return [
         Trial(
             claim=choice,
@@ -82,13 +82,13 @@ def run_ablations(
 
     Args:
         planned: Trainings to run.
-        runs: Folder of the runs, with the kept pairs in `pairs`.
+        runs: Folder of the runs, with cached pairs in `pairs`.
         rendered: Set of held-out rendered pairs, scored in addition to the held-out collages.
         report: CSV file to write.
-        console: Shows the progress.
+        console: Console that shows the progress.
 
     Raises:
-        StereoweaveError: If training or held-out pairs are missing; raised before the first training.
+        StereoweaveError: If training or held-out pairs are missing, before the first training.
     """
     register_variants()
     rendered_pairs = RenderedSet(Shards(rendered))

@@ -27,12 +27,15 @@ from stereoweave.learn.models.weave import (
 
 
 def upsample_bilinear(x: Float[Tensor, "b 1 h w"], weights: Tensor) -> Float[Tensor, "b 1 h2 w2"]:
-    """Enlarge maps to twice their size. Ignores the weights, which `upsample` uses in other networks."""
+    """Enlarge maps to twice their size. The weights, which `upsample` uses in other networks, are ignored."""
     return F.interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=False)
 
 
 def soft_argmax(logits: Float[Tensor, "b d h w"]) -> Float[Tensor, "b 1 h w"]:
-    """Return the expected level under a softmax over all levels (Kendall et al. 2017); a mixture at edges."""
+    """Return the expected level under a softmax over all levels (Kendall et al. 2017).
+
+    At edges, this is a mixture of both surfaces.
+    """
     levels = torch.arange(logits.shape[1], device=logits.device).view(1, -1, 1, 1)
     return (logits.softmax(1) * levels).sum(1, keepdim=True)
 
@@ -50,7 +53,7 @@ class BilinearWeaveNet(WeaveNet):
 
 
 class AllLevelsWeaveNet(WeaveNet):
-    """WeaveNet whose disparity is the expectation over all levels, not only over those around the best."""
+    """WeaveNet whose disparity is the expectation over all levels, not only those around the best level."""
 
     def read_disparity(self, scores: Tensor, decoded: Tensor) -> Tensor:
         return soft_argmax(scores)

@@ -1,1 +1,1 @@
-"""Hand-held-like stereo pairs with exact correspondences, to measure how well pairs are aligned."""
+"""Simulated hand-held stereo pairs with exact correspondences, for measuring how well pairs are aligned."""

@@ -15,9 +15,9 @@ from stereoweave.io.images import write_image
 
 def handheld(
     real: Annotated[Path, typer.Argument(help="Folder of real pairs, as for stereoweave bench pairs.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.")],
 ) -> None:
-    """Write 200 hand-held-like pairs: left.png and right.png, with true correspondences in points.npz."""
+    """Write 200 simulated hand-held pairs: left.png, right.png, and correspondences in points.npz."""
     from experiments.handheld.pairs import make_handheld_pairs
 
     for made in make_handheld_pairs(real):

@@ -20,19 +20,19 @@ class Size(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Ranges:
-    """Ranges of the random draws; each is uniform, and symmetric unless stated otherwise.
+    """Ranges of the random parameters, drawn uniformly; each range is symmetric unless stated otherwise.
 
     Attributes:
         turn_degrees: Rotation of each camera about each of its axes, relative to the rectified pair. A
             rotation that both share tilts the baseline, as if one camera were higher or farther forward.
         shift: Displacement of the principal point along x and y, as a fraction of the picture's width.
-        scale: Difference of the right camera's focal length from the left one's, as a fraction.
+        scale: Difference between the right and the left camera's focal length, as a fraction.
         distortion: Radial distortion of both lenses: the displacement at the corner, as a fraction of its
             distance from the centre.
-        distortion_difference: Difference of the right lens's distortion from the left one's.
+        distortion_difference: Difference between the right and the left lens's distortion.
         exposure_stops: Exposure of the right picture relative to the left one.
         balance: Difference between the exposures of the right picture's colour channels, as a fraction.
-        noise_levels: Standard deviation of the noise, from 0.
+        noise_levels: Greatest standard deviation of the noise, in levels of 0..255; the least is 0.
         quality: Least and greatest quality of the JPEG files.
     """
 
@@ -51,11 +51,11 @@ class Ranges:
 class HandheldCamera:
     """A camera that looks at a picture of the rectified pair from that picture's own camera centre.
 
-    The picture may so be taken again exactly, whatever the scene's depth: rotation, focal length and
+    The picture can therefore be retaken exactly for any scene depth, because rotation, focal length and
     distortion do not change what is visible along a ray.
 
     Attributes:
-        turn: [3, 3], rotates rays of this camera to rays of the rectified one.
+        turn: Rotation [3, 3] from rays of this camera to rays of the rectified camera.
         focal_px: Focal length of this camera.
         shift_px: x and y of the principal point relative to the picture's centre.
         distortion: Undistorted radius divided by distorted radius at the corner, minus 1.
@@ -71,7 +71,7 @@ class HandheldCamera:
     def find_sources(
         self, places_px: Float[np.ndarray, "n 2"], size: Size, original: Size
     ) -> Float[np.ndarray, "n 2"]:
-        """Return the places in the rectified picture that this camera shows at the given places."""
+        """Return the points of the rectified picture that this camera shows at the given places."""
         distorted = (places_px - _centre_px(size) - self.shift_px) / self.focal_px
         squares = (distorted**2).sum(1, keepdims=True) / self._corner(size) ** 2
         rays = np.column_stack([distorted * (1 + self.distortion * squares), np.ones(len(places_px))])
@@ -81,7 +81,10 @@ class HandheldCamera:
     def find_places(
         self, sources_px: Float[np.ndarray, "n 2"], size: Size, original: Size
     ) -> Float[np.ndarray, "n 2"]:
-        """Return where this camera shows places of the rectified picture; the inverse of `find_sources`."""
+        """Return the places at which this camera shows points of the rectified picture.
+
+        This inverts `find_sources`.
+        """
         seen = (sources_px - _centre_px(original)) / self.original_focal_px
         rays = np.column_stack([seen, np.ones(len(seen))]) @ self.turn
         undistorted = rays[:, :2] / rays[:, 2:]
@@ -103,8 +106,8 @@ def draw_cameras(
     """Draw the left and the right camera.
 
     Args:
-        rng: Source of all draws.
-        ranges: Ranges of the draws.
+        rng: Random number generator.
+        ranges: Ranges of the random parameters.
         width_px: Width of the rectified pictures.
         focal_px: Focal length of the rectified pictures.
     """

@@ -1,4 +1,4 @@
-"""Hand-held-like pairs: rectified pairs of known disparity, taken again by two hand-held cameras."""
+"""Simulated hand-held pairs: rectified pairs of known disparity, retaken by two simulated cameras."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from experiments.handheld.cameras import HandheldCamera, Ranges, Size, draw_came
 from stereoweave.data.readers import list_scenes
 from stereoweave.stereo import StereoPair
 
-# The draws that were fixed before any method of alignment was tuned. Change neither.
+# Seed and ranges were fixed before any method of alignment was tuned. Change neither.
 SEED, RANGES = 20260, Ranges()
 PAIRS_EACH = 100
 # Rendered originals: scene and number of pairs.
@@ -31,9 +31,9 @@ class Original:
 
     Attributes:
         name: Name of the scene.
-        pair: The pair.
+        pair: The left and the right image.
         truth_px: float32 [H, W], disparity of the left view; NaN where unknown.
-        focal_px: Focal length.
+        focal_px: Focal length in pixels.
     """
 
     name: str
@@ -44,12 +44,12 @@ class Original:
 
 @dataclass(frozen=True, kw_only=True)
 class HandheldPair:
-    """A pair as two hand-held cameras take it.
+    """A pair taken by two hand-held cameras.
 
     Attributes:
-        name: Name of the original and number of the pair.
-        pair: The pictures, of one size.
-        left_px, right_px: float64 [N, 2], places at which both show the same point of the scene.
+        name: Name of the original, followed by the number of the pair.
+        pair: The two pictures, which have the same size.
+        left_px, right_px: float64 [N, 2], places at which the two pictures show the same point of the scene.
     """
 
     name: str
@@ -59,25 +59,25 @@ class HandheldPair:
 
 
 def make_handheld_pairs(real: Path) -> Iterator[HandheldPair]:
-    """Yield the pairs: the rendered ones, then those made of the real pairs below a folder, in turns."""
+    """Yield pairs made from rendered originals, then pairs made from each real pair of a folder in turn."""
     scenes = list_scenes(real)
     for index, original in enumerate(_render_originals()):
         yield take_again(original, index)
     for index, read in enumerate(islice(cycle(scenes), PAIRS_EACH), start=PAIRS_EACH):
         scene = read()
-        # Any focal length fits a rectified pair of unknown depth; this one is a phone's.
+        # Any focal length fits a rectified pair of unknown depth; this one is typical of a phone.
         focal_px = float(scene.pair.left.shape[1])
         original = Original(name=scene.name, pair=scene.pair, truth_px=scene.truth_px, focal_px=focal_px)
         yield take_again(original, index)
 
 
 def take_again(original: Original, index: int, ranges: Ranges = RANGES) -> HandheldPair:
-    """Take a rectified pair again with two hand-held cameras.
+    """Retake a rectified pair with two hand-held cameras.
 
     Args:
         original: The rectified pair.
-        index: Number of the pair; determines all draws, together with the seed.
-        ranges: Ranges of the draws.
+        index: Number of the pair; together with the seed, it determines all random numbers.
+        ranges: Ranges of the random parameters.
     """
     rng = np.random.default_rng((SEED, index))
     before = Size(original.pair.left.shape[1], original.pair.left.shape[0])
@@ -115,7 +115,7 @@ def _render_originals() -> Iterator[Original]:
 
 
 def _find_size(cameras: tuple[HandheldCamera, HandheldCamera], original: Size) -> Size:
-    """Return the largest size, of the original's proportions, at which both cameras see only its inside."""
+    """Return the largest size with the original's proportions at which both cameras see only the original."""
     last_px = np.array(original) - 1
     for percent in range(100, 0, -1):
         size = Size(original.width * percent // 100, original.height * percent // 100)
@@ -123,7 +123,7 @@ def _find_size(cameras: tuple[HandheldCamera, HandheldCamera], original: Size) -
         sources_px = np.concatenate([camera.find_sources(border_px, size, original) for camera in cameras])
         if (sources_px >= 0).all() and (sources_px <= last_px).all():
             return size
-    raise AssertionError("the ranges leave no picture")
+    raise AssertionError("the ranges leave nothing of the picture")
 
 
 def _border(size: Size) -> Float[np.ndarray, "n 2"]:
@@ -147,7 +147,7 @@ def _take(
 def _find_correspondences(
     cameras: tuple[HandheldCamera, HandheldCamera], truth_px: Float32[np.ndarray, "h w"], size: Size
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
-    """Return places of both hand-held pictures that show the same points, visible to both cameras."""
+    """Return the places at which both hand-held pictures show the same points, visible to both cameras."""
     original = Size(truth_px.shape[1], truth_px.shape[0])
     rows, columns = np.nonzero(_find_visible(truth_px))
     on_grid = (rows % _GRID_PX == 0) & (columns % _GRID_PX == 0)

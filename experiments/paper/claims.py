@@ -18,9 +18,9 @@ class PaperRow:
         seed: Seed of the initial weights, the training pairs and their order.
         steps: Steps of the training; it has seen steps * batch pairs.
         prediction: Loss between codes that the network was trained with.
-        squared_error: Squared error between codes without exponent, which is comparable between exponents.
-        epe_px, epe_cm, mae_sourced, sourced_percent, mae_filled, psnr_db, ssim: See `ViewRow`.
-        minutes: Wall time of the training and of the one that it started from; trainings may run in parallel.
+        squared_error: Squared error between codes without exponent; comparable between exponents.
+        epe_px, epe_cm, mae_sourced, sourced_percent, mae_filled, psnr_db, ssim: See `ProjectionRow`.
+        minutes: Wall time, including the training that it started from; trainings may run in parallel.
     """
 
     claim: str
@@ -65,7 +65,7 @@ class Comparison:
 
     @property
     def fair(self) -> bool:
-        """Whether the measure means the same for both settings. Codes of two exponents are not comparable."""
+        """Whether the measure means the same for both settings, unlike losses of codes of two exponents."""
         return (self.claim, self.measure) != (ADJUSTMENT, "prediction")
 
 
@@ -136,7 +136,7 @@ def list_comparisons(depth: bool = False) -> Iterator[Comparison]:
 
 
 def _rival_changes(depth: bool) -> Iterator[tuple[str, str, str, str, tuple[_Measure, ...]]]:
-    """Yield Table I's claims about each rival, as rows of _CHANGES; with `depth`, its depth column only."""
+    """Yield Table I's claims about each rival, as rows of _CHANGES; with `depth`, only its depth column."""
     for rival in ("densemapnet", "dispnet", "psmnet"):
         claim = NETWORKS_SHORT if rival == "psmnet" else NETWORKS
         measures = (

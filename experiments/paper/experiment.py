@@ -1,4 +1,4 @@
-"""Run of the paper's experiment: every training of trials.py, on the same pairs in the same order."""
+"""The paper's experiment: runs every training of trials.py on the same pairs in the same order."""
 
 import multiprocessing
 import os
@@ -26,14 +26,14 @@ def plan(
 
     Args:
         base: The paper's recipe for the data at hand; the exponent is fitted to its training pairs.
-        runs: Folder of the runs, with the kept pairs in `pairs`.
-        seeds: Repetitions of each training.
-        console: Shows the progress.
+        runs: Folder of the runs, with cached pairs in `pairs`.
+        seeds: Number of repetitions of each training, with different seeds.
+        console: Console that shows the progress.
         claims: Names in CLAIMS.
 
     Raises:
-        StereoweaveError: If the base has another network, too few steps, or depth as the target of pairs
-            without a camera.
+        StereoweaveError: If the base has another network, too few steps, or depth as its target for
+            pairs without a camera.
     """
     _check_base(base)
     training, _ = (cache_pairs(pairs, console) for pairs in open_sources(base, runs / "pairs"))
@@ -53,7 +53,7 @@ def run_trials(planned: Iterable[Trial], runs: Path, jobs: int, console: Console
         planned: Trials whose training pairs all exist, so that no two trainings create the same ones.
         runs: Folder of the runs.
         jobs: Number of trainings that run in parallel and share the processor's cores.
-        console: Shows the progress.
+        console: Console that shows the progress.
     """
     recipes = {trial.recipe.name: trial.recipe for trial in planned}.values()
     # A training that starts from another one must wait for its checkpoint.
@@ -67,12 +67,13 @@ def _check_base(base: Recipe) -> None:
     for key, expected in {"model": "fast_depth", **target}.items():
         if (found := getattr(base, key)) != expected:
             raise StereoweaveError(
-                f"{base.name}: {key} = {found!r}, expected {expected!r}, which the experiment starts from"
+                f"{base.name}: {key}: expected {expected!r}, from which the experiment starts, "
+                f"found {found!r}"
             )
     if base.steps < SHORT:
         raise StereoweaveError(
-            f"{base.name}: steps = {base.steps}, expected at least {SHORT}, "
-            "because some trainings take a quarter of them"
+            f"{base.name}: steps: expected at least {SHORT}, because some trainings take a quarter of them, "
+            f"found {base.steps}"
         )
 
 

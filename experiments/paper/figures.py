@@ -20,9 +20,9 @@ from stereoweave.io.files import replacing
 from stereoweave.stereo import DepthCurve, Sample
 
 Estimated = tuple[Sample, Mapping[str, Float[np.ndarray, "_ _"]]]
-"""A sample, and its left view's disparities in px [H, W] by column title. Rows may differ in size."""
+"""A sample, and disparities of its left view in px [H, W], by column title. Samples may differ in size."""
 
-# Okabe and Ito's colours, distinguishable by colour-blind readers.
+# Okabe and Ito's colours, which colour-blind readers can distinguish.
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 _HISTOGRAM_HEIGHT = 0.5
 _PICTURE_WIDTH_IN = 2.2
@@ -54,7 +54,7 @@ def draw_exponent_curves(
 
 
 def draw_validation(path: str | Path, curves: Mapping[str, Sequence[Sequence[tuple[int, float]]]]) -> None:
-    """Write the right plot of Fig. 2: held-out error against steps; thin lines are seeds, bold lines means.
+    """Write the right plot of Fig. 2: held-out error against steps. Thin lines show seeds, bold lines means.
 
     Args:
         path: Picture to write.

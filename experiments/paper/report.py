@@ -53,12 +53,12 @@ class Report:
 
     Attributes:
         base: Recipe that the trials start from.
-        training, held_out: Pairs of the base.
+        training, held_out: Pairs of the base recipe.
         planned: All trials.
-        trained: Trials that are trained to their end.
+        trained: Trials whose training is finished.
         missing: Names of the other trials' recipes.
-        kept: Checkpoints of the trained trials, by name of the recipe.
-        curves: Scores of the trained trials by step, by name of the recipe.
+        kept: Checkpoints of the trained trials, by the recipe's name.
+        curves: Scores of the trained trials in the order of steps, by the recipe's name.
         rows: One row per trained trial.
         common: Scores of untrained methods on the base's held-out pairs.
     """
@@ -85,7 +85,7 @@ def write_report(base: Recipe, planned: Sequence[Trial], runs: Path, out: Path) 
 
     Args:
         base: Recipe that the trials start from.
-        planned: All trials; paper.md lists those that are not trained to their end.
+        planned: All trials; paper.md lists the unfinished ones.
         runs: Folder of the runs.
         out: Folder to write to. If it contains speed.csv, paper.md includes these run times.
 
@@ -140,7 +140,7 @@ def _score(recipes: Sequence[Recipe], runs: Path) -> tuple[dict[str, ProjectionR
     common: list[ProjectionRow] = []
     for pairs in dict.fromkeys(identify_held_out(recipe) for recipe in others):
         names = list(dict.fromkeys(recipe.name for recipe in others if identify_held_out(recipe) == pairs))
-        # Quiet, because all pairs were created with the plan.
+        # Quiet, because all pairs were created during planning.
         found = evaluate([runs / name for name in names], runs / "pairs", Console(quiet=True))
         scores |= {row.method: row for row in found if row.method in names}
         if pairs == identify_held_out(base):
@@ -254,7 +254,7 @@ def _describe_fit(planned: Sequence[Trial]) -> str:
 
 
 def _read_run_times(path: Path) -> str:
-    """Return a Markdown table of the run times in a file; empty if there is no file."""
+    """Return a Markdown table of the run times in a file; an empty string if there is no file."""
     if not path.exists():
         return ""
     try:
@@ -262,8 +262,8 @@ def _read_run_times(path: Path) -> str:
             table = run_time_table(csv.DictReader(file))
     except (KeyError, TypeError, ValueError) as error:
         raise FormatError(
-            f"{path}: expected the rows of `python -m experiments.speed`, found {error}; "
-            "write it again or remove it"
+            f"{path}: expected the rows of `python -m experiments.speed`, found rows that cannot be "
+            f"parsed ({error}); write the file again or remove it"
         ) from error
     return f"One pair of 640x480 on all cores of a CPU; the paper's times are from GPUs.\n\n{table}"
 
@@ -281,7 +281,7 @@ def _format_common_table(rows: Sequence[ProjectionRow], depth: bool) -> str:
 
 
 def _describe_transfer(report: Report) -> str:
-    """Describe after how many steps the tuned network reaches the best loss of the one from scratch."""
+    """Describe after how many steps the tuned network reaches the best loss of the training from scratch."""
     curves = {
         trial.setting: report.curves[trial.recipe.name] for trial in report.trained if trial.claim == TRANSFER
     }
@@ -302,7 +302,7 @@ def _describe_transfer(report: Report) -> str:
 
 
 def _draw(report: Report, out: Path) -> None:
-    """Draw Figs. 2, 3 and 5, and Fig. 2 for the projection loss, as far as their trials are trained."""
+    """Draw Figs. 2, 3 and 5, and Fig. 2 for the projection loss, for claims whose trials are finished."""
     held_out = report.held_out
     claims = {row.claim for row in report.rows}
     if ADJUSTMENT in claims:

@@ -43,9 +43,9 @@ def list_trials(base: Recipe, seeds: int, fitted_exponent: float) -> list[Trial]
 
     Args:
         base: The paper's recipe for the data at hand.
-        seeds: Repetitions of each training, except of DispNet, PSMNet, the transfer and the iterations, which
-            run once.
-        fitted_exponent: The exponent p fitted to the histogram of the base's training truth.
+        seeds: Number of repetitions of each training, except for DispNet, PSMNet, the transfer and the
+            iterations, which run once.
+        fitted_exponent: The exponent p fitted to the histogram of the ground truth that the base trains on.
     """
     # Otherwise every training would replace its exponent p by the fitted one.
     base = replace(base, fit_exponent=False)

@@ -1,1 +1,1 @@
-"""Run times of the paper's network and its rivals."""
+"""Benchmark of the run times of the paper's network and its rivals."""

@@ -23,7 +23,7 @@ def speed(
     read = read_recipe(recipe)
     with require_train_extra():
         from experiments.speed.timing import measure_run_times
-    write_and_print(out, "A pair of 640x480", measure_run_times(read))
+    write_and_print(out, "One 640x480 pair", measure_run_times(read))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -1,4 +1,4 @@
-"""Run times of the paper's network and its rivals, measured together, relative to DenseMapNet's."""
+"""Run times of the paper's network and its rivals, measured together and compared with DenseMapNet's."""
 
 import tempfile
 import time
@@ -44,10 +44,10 @@ class SpeedRow:
 def measure_run_times(
     recipe: Recipe, networks: Sequence[str] = NETWORKS, turns: int = TURNS
 ) -> list[SpeedRow]:
-    """Return a row per network, timed in turns so that a slower phase of the machine affects all alike.
+    """Return a row per network. Networks are timed in turns, so that slow phases affect all alike.
 
     Args:
-        recipe: Recipe that builds the networks; its target and range become disparity up to 192 px.
+        recipe: Recipe of the networks, except that the target becomes disparity up to 192 px.
         networks: Names in MODELS, including DenseMapNet's.
         turns: Number of repetitions; PSMNet, by far the slowest, is timed a third as often.
     """

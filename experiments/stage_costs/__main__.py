@@ -13,7 +13,7 @@ from stereoweave.cli.options import make_parent_folder, require_train_extra
 
 def stage_costs(
     runs: Annotated[list[Path], typer.Argument(help="Checkpoints, or run folders of stereoweave train.")],
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="CSV file to write in addition.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Additional CSV file to write.")] = None,
 ) -> None:
     """Measure the stages of trained WeaveNets, and print a Markdown table.
 

@@ -27,7 +27,7 @@ TURNS = 15
 PRODUCT = f"product of two {PRODUCT_SIDE}x{PRODUCT_SIDE} matrices"
 TOTAL = "total"
 
-# Stages of modules whose name differs from that of their stage.
+# Stages by module, where the two names differ.
 _STAGES = {
     "to_match": "correlation",
     "weights": "upsampling",
@@ -52,15 +52,15 @@ _VIEWS = {"Reshape", "Squeeze", "Unsqueeze", "Flatten", "Identity"}
 
 @dataclass(frozen=True, kw_only=True)
 class StageCost:
-    """Cost of one stage for a 640x480 pair, both views, in float32.
+    """Cost of one stage for both views of a 640x480 pair, in float32.
 
     Attributes:
         network: Name of the recipe; "" for PRODUCT.
         stage: Name of the stage; TOTAL for all stages; PRODUCT for the matrix product that measures the peak.
         multiply_adds: Multiply-adds of convolutions, matrix products and sums of products.
         moved_mb: 10^6 bytes that kernels read and write, weights included; much of it stays in caches.
-        one_thread_ms, two_threads_ms: Minimum over the turns, because other work only adds time.
-        one_thread_peak_percent, two_threads_peak_percent: Multiply-adds per second, relative to PRODUCT's.
+        one_thread_ms, two_threads_ms: Minimum time over the turns, because other work can only add time.
+        one_thread_peak_percent, two_threads_peak_percent: Multiply-adds per second, in percent of PRODUCT's.
     """
 
     network: str
@@ -103,8 +103,8 @@ def measure_stage_costs(runs: Sequence[Path], turns: int = TURNS) -> list[StageC
     """Measure a large matrix product, then each network's stages in the order of execution and their total.
 
     Args:
-        runs: Checkpoints of WeaveNets or of their ablations, or folders of runs for their last checkpoints.
-        turns: Repetitions of each measurement.
+        runs: Checkpoints of WeaveNets or of their ablations, or run folders, whose last checkpoints are used.
+        turns: Number of repetitions of each measurement.
 
     Raises:
         StereoweaveError: If a network is not a WeaveNet.
@@ -137,7 +137,7 @@ def format_table(rows: Sequence[StageCost]) -> str:
 
 
 def trace(network: WeaveNet) -> onnx.ModelProto:
-    """Return the network's graph as `export_fixed_graph` makes it, with the module of each node noted."""
+    """Return the network's graph as `export_fixed_graph` makes it, annotated with the module of each node."""
     return export_annotated_graph(network, HEIGHT_PX, WIDTH_PX, None)
 
 
@@ -188,7 +188,7 @@ def measure(graph: onnx.ModelProto, stages: Mapping[str, str], turns: int) -> di
     Args:
         graph: Graph with inputs of one fixed size.
         stages: Result of `find_stages`; if empty, only TOTAL is measured.
-        turns: Repetitions, after one for warm-up.
+        turns: Number of repetitions after one for warm-up.
     """
     profiles = [profile(graph, threads, turns) for threads in (1, 2)]
     of_kernels = [_assign_kernels(each.optimised, stages) for each in profiles]

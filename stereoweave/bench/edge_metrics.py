@@ -1,9 +1,9 @@
 """Disparity errors and flying pixels near depth edges, where new views tear and smear.
 
 An edge lies between two neighbours, in a row or a column, whose known true disparities differ by more than
-2 px; a surface that both cameras see well changes by less than 1 px from pixel to pixel. A known pixel is
-near an edge if it is one of the three on either side. Sparse ground truth, such as from a laser scanner, has
-edges only between known neighbours. Without any edge, every metric is NaN.
+2 px. On a surface that both cameras see well, disparity changes by less than 1 px from pixel to pixel. A
+known pixel is near an edge if it is one of the three pixels on either side. Sparse ground truth, such as from
+a laser scanner, has edges only between known neighbours. If there are no edges, every metric is NaN.
 """
 
 import cv2
@@ -18,7 +18,7 @@ FLYING_PX = 2.0
 
 
 def near_edge(truth_px: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Return the mask of the known pixels near an edge: within three pixels, diagonals included."""
+    """Return the mask of the known pixels within three pixels of an edge, also diagonally."""
     known_px = np.where(np.isfinite(truth_px), truth_px, np.nan).astype(np.float64)
     at_edge = np.zeros(truth_px.shape, np.uint8)
     for axis in (0, 1):
@@ -48,9 +48,9 @@ def flying_percent(estimate_px: Float[np.ndarray, "h w"], truth_px: Float[np.nda
     """Return the percentage of known pixels near an edge whose estimate lies on neither surface.
 
     A pixel is flying if its estimate differs by more than 2 px from every known true disparity in the 7x7
-    neighbourhood, which reaches across the edge. It then lies between the two surfaces, in front of both or
-    behind both. Slanted surfaces do not count as flying. An edge that is displaced by up to 3 px causes
-    errors but no flying pixels.
+    neighbourhood, which reaches across the edge. The estimate then lies between the two surfaces, in front
+    of both or behind both. Slanted surfaces do not count as flying. An edge that is displaced by up to 3 px
+    causes errors but no flying pixels.
     """
     near = near_edge(truth_px)
     # A pixel within 2 px of its own truth is on a surface; only the few others need the search.

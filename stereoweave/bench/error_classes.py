@@ -38,7 +38,8 @@ class ClassErrors:
     Attributes:
         share_percent: Share of known pixels that are in the class.
         bad1_percent, bad2_percent: Share of known pixels that are in the class and off by more than 1 or
-            2 px. Summed over the classes, they give the estimate's bad-1 and bad-2; an empty class has 0.
+            2 px. Summed over the classes, they give the estimate's bad-1 and bad-2. In an empty class, they
+            are 0.
         bad1_within_percent, bad2_within_percent: Share of the class that is off by more than 1 or 2 px.
         epe_px: Mean absolute error within the class.
     """
@@ -56,10 +57,10 @@ def classify(
     truth_px: Float[np.ndarray, "h w"],
     occluded: Bool[np.ndarray, "h w"] | None = None,
 ) -> dict[str, Bool[np.ndarray, "h w"]]:
-    """Return a mask per class, in the order of `CLASSES`; each known pixel is in exactly one.
+    """Return a mask per class, in the order of `CLASSES`; each known pixel is in exactly one mask.
 
     Args:
-        left: RGB.
+        left: Left image in RGB.
         truth_px: True disparity of the left view; NaN and infinity mean unknown.
         occluded: True occlusion of the left view, with or without the pixels outside the right image.
             Default: computed from truth_px, where surfaces of unknown disparity occlude nothing.
@@ -92,7 +93,7 @@ def class_errors(
     Args:
         estimate_px: Disparity of the left view; NaN counts as bad.
         truth_px: See `classify`.
-        masks: From `classify`.
+        masks: Masks from `classify`.
     """
     known = np.isfinite(truth_px)
     return {

@@ -1,4 +1,4 @@
-"""Benchmark of the temporal filter: flicker and errors with and without it, on rendered noisy videos."""
+"""Temporal-filter benchmark on noisy rendered videos: flicker and errors with and without the filter."""
 
 import time
 from collections.abc import Iterator, Sequence
@@ -43,11 +43,12 @@ class FlickerRow:
         noise_levels: Standard deviation of the image noise, in levels of 0..255.
         flicker_px: Flicker of the left view's disparity (flicker_metrics.py).
         view_flicker_levels: Flicker of the middle view, in levels of 0..255. The view is rendered from the
-            noise-free images, so it flickers only if the disparity does.
+            noise-free images, so it flickers only if the disparity flickers.
         epe_px: End-point error of the left view.
         moving_epe_px: End-point error on the moving object; NaN if there is none.
-        uncovered_epe_px: End-point error on pixels that the previous frame did not show; NaN without any.
-        time_ms: Median time of the temporal filter per frame; NaN without the filter.
+        uncovered_epe_px: End-point error on pixels that the previous frame did not show; NaN if there are
+            none.
+        time_ms: Median time of the temporal filter per frame; NaN if the filter is not used.
     """
 
     film: str
@@ -74,7 +75,7 @@ class _MethodOutput(NamedTuple):
     time_ms: float
 
 
-def score_flicker(  # noqa: PLR0913 - each is a word of the command line
+def score_flicker(  # noqa: PLR0913 - each is an option of the command line
     scenes: Sequence[str],
     model: str | Path = "small",
     *,
@@ -84,22 +85,24 @@ def score_flicker(  # noqa: PLR0913 - each is a word of the command line
     threads: int | None = None,
     provider: str = CPU,
 ) -> Iterator[FlickerRow]:
-    """Yield two rows, without and with the temporal filter, for each of four videos per scene.
+    """Yield two rows, without and with the temporal filter, for each of the four videos of a scene.
 
     Args:
         scenes: Scene names, as for `stereoweave synth make`.
         model: See `Matcher`.
         frames: Frames per video, at least 2.
-        size_px: Width and height.
+        size_px: Width and height of a frame.
         seed: Seed of the scenes and the noise.
-        threads: Default: all cores.
+        threads: Number of CPU threads. Default: all cores.
         provider: See `Matcher`.
 
     Raises:
         StereoweaveError: If a scene or the model is unknown, or there are too few frames.
     """
     if frames < 2:
-        raise StereoweaveError(f"frames: expected 2 or more, because flicker compares two, found {frames}")
+        raise StereoweaveError(
+            f"frames: expected at least 2, because flicker is a change between frames, found {frames}"
+        )
     specs = [RenderSpec(scene=scene, seed=seed, size_px=size_px, frames=_PATH_FRAMES) for scene in scenes]
     matcher = Backend(model=model, threads=threads, provider=provider).matcher()
     for spec in specs:
@@ -125,7 +128,7 @@ def score_flicker(  # noqa: PLR0913 - each is a word of the command line
 
 
 def average_rows(rows: Sequence[FlickerRow]) -> list[FlickerRow]:
-    """Return a mean row over the scenes for each video and method; its `film` joins both names."""
+    """Return a mean row over the scenes for each video and method, with both names joined in `film`."""
     groups: dict[tuple[str, str], list[FlickerRow]] = {}
     for row in rows:
         groups.setdefault((row.film, row.method), []).append(row)

@@ -19,7 +19,7 @@ def flicker(
     visible: Bool[np.ndarray, "h w"],
     change: Float[np.ndarray, "h w"] | float = 0.0,
 ) -> float:
-    """Return the mean error of the points' change from one frame to the next; NaN without points.
+    """Return the mean error of the points' change from one frame to the next; NaN if there are no points.
 
     The error at x is |after(x + motion(x)) - before(x) - change(x)|, in the unit of the values, with `after`
     interpolated linearly. An error that stays constant is not flicker. For disparity, this is the temporal
@@ -40,7 +40,7 @@ def flicker(
     shapes = [list(values.shape[:2]) for values in (before, after, motion_px, visible)]
     if any(shape != shapes[0] for shape in shapes):
         raise StereoweaveError(
-            f"flicker: expected two frames, their motion and a mask of one size, found {shapes}"
+            f"flicker: expected two frames, their motion and a mask, all of the same size, found {shapes}"
         )
     columns, rows, inside = _find_targets(motion_px)
     if (visible & ~inside).any():
@@ -66,7 +66,8 @@ def find_seen_again(
 ) -> Bool[np.ndarray, "h w"]:
     """Return the mask of the points that are visible in both frames.
 
-    A point of the first frame is visible in the second if all four pixels around its target show its surface.
+    A point of the first frame is visible in the second if all four pixels around its target show
+    the same surface.
 
     Args:
         before_px: True disparity of the first frame.

@@ -18,12 +18,12 @@ LEFT, MIDDLE, RIGHT = 0.0, 0.5, 1.0
 NOISE_LEVELS = 4.0
 # Supersampling of a passing object along each axis, so that it can move by quarters of a pixel.
 _FINE = 4
-# How much the object's disparity exceeds the greatest of the scene, at least.
+# Minimum by which the object's disparity exceeds the greatest disparity of the scene.
 _IN_FRONT_PX = 8
 
 Change = tuple[Float[np.ndarray, "h w 2"], Float[np.ndarray, "h w"]]
-"""Change of a frame's points from that frame to another, seen from one position: motion to the right and down
-in px, and change of disparity in px."""
+"""Change of points from one frame to another, seen from the same position: motion to the right and down, and
+change of disparity, in px."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +35,7 @@ class RenderedVideo:
         pairs: The frames, without noise.
         disparities_px: True disparity [H, W] of each frame in the views at LEFT and MIDDLE.
         moving: Mask of the moving object in the left view of each frame.
-        change: Returns the `Change` from one frame to another, seen from a position.
+        change: Function that returns the `Change` from one frame to another, seen from a position.
     """
 
     name: str

@@ -1,7 +1,7 @@
 """Error metrics in double precision, for all benchmarks and validations.
 
 In ground truth, NaN and infinity mean unknown, and unknown pixels do not count. A pixel whose estimate is NaN
-is bad. A mean over no pixel is NaN.
+is bad. A mean over no pixels is NaN.
 """
 
 from typing import NamedTuple
@@ -23,7 +23,7 @@ class Sparsification(NamedTuple):
 
     Attributes:
         kept: Errors if the least confident pixels are dropped first.
-        oracle: Errors if the pixels of largest error are dropped first; no confidence can do better.
+        oracle: Errors if the pixels with the largest errors are dropped first; no confidence can do better.
     """
 
     kept: Float[np.ndarray, " n"]
@@ -69,18 +69,18 @@ def mae(
     truth: UInt8[np.ndarray, "h w 3"],
     where: Bool[np.ndarray, "h w"] | None = None,
 ) -> float:
-    """Return the mean absolute difference of two images, in levels of 0..255, over the mask `where`."""
+    """Return the mean absolute difference between two images, in levels of 0..255, over the mask `where`."""
     error = np.abs(_subtract(image, truth))
     return _mean(error if where is None else error[where])
 
 
 def psnr_db(image: UInt8[np.ndarray, "h w 3"], truth: UInt8[np.ndarray, "h w 3"]) -> float:
-    """Return the peak signal-to-noise ratio of two images in dB, at most 148 dB for equal images."""
+    """Return the peak signal-to-noise ratio of two images in dB; 148 dB if they are equal."""
     return float(10 * np.log10(255**2 / max(_mean(_subtract(image, truth) ** 2), 1e-10)))
 
 
 def ssim(image: UInt8[np.ndarray, "h w 3"], truth: UInt8[np.ndarray, "h w 3"]) -> float:
-    """Return the mean structural similarity of two images' 8-bit luminance; 1 if both are equal.
+    """Return the mean structural similarity of two images' 8-bit luminance; 1 if they are equal.
 
     Source: Wang et al. 2004, with an 11x11 Gaussian window of sigma 1.5, K1 = 0.01 and K2 = 0.03. Borders are
     mirrored.
@@ -109,7 +109,7 @@ def calibration_error(probability: Float[np.ndarray, "..."], happened: Bool[np.n
 def calibration_bins(
     probability: Float[np.ndarray, "..."], happened: Bool[np.ndarray, "..."]
 ) -> Float[np.ndarray, "3 n"]:
-    """Return mean probability, observed frequency and share of values for each non-empty bin, out of 15."""
+    """Return the mean probability, the observed frequency and the share of values of each non-empty bin."""
     where = np.minimum((probability * _BINS).astype(int), _BINS - 1).ravel()
     counts = np.bincount(where, minlength=_BINS)
     used = counts > 0
@@ -120,11 +120,12 @@ def calibration_bins(
 def sparsification(error: Float[np.ndarray, " n"], confidence: Float[np.ndarray, " n"]) -> Sparsification:
     """Return the sparsification curves of a confidence and of the oracle.
 
-    Source: Ilg et al. 2018. Curves are averaged over all orders of pixels of equal confidence.
+    Source: Ilg et al. 2018. Pixels of equal confidence may be dropped in any order; curves are averaged over
+    all orders.
 
     Args:
         error: Error of each pixel [N], such as its absolute error in px, or 100 if bad and 0 if good.
-        confidence: Any value that ranks the pixels [N]; may be infinite but not NaN.
+        confidence: Any value that ranks the pixels [N]; it may be infinite but not NaN.
     """
     _check_shapes(error, confidence)
     return Sparsification(kept=_average_kept(error, confidence), oracle=_average_kept(error, -error))

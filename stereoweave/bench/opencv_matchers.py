@@ -1,4 +1,4 @@
-"""OpenCV's matchers with the settings of OpenCV's sample, hole filling, and left-right confidence."""
+"""OpenCV's matchers with the settings of OpenCV's sample program, hole filling and left-right confidence."""
 
 from collections.abc import Callable
 from functools import partial
@@ -19,8 +19,9 @@ DISPARITIES = 192
 def _make_sgbm(mode: int) -> MapMatch:
     """Create a semi-global block matcher over 192 disparities.
 
-    The settings are those of OpenCV's sample stereo_match.cpp at a block size of 5 (P1 = 8*3*5*5,
-    P2 = 32*3*5*5). Only the speckle range is 2 instead of 32, as StereoSGBM's documentation recommends.
+    The settings are those of OpenCV's sample program stereo_match.cpp at a block size of 5 (P1 = 8*3*5*5,
+    P2 = 32*3*5*5), except for the speckle range. It is 2 instead of 32, as StereoSGBM's documentation
+    recommends.
     """
     matcher = cv2.StereoSGBM.create(
         minDisparity=0,
@@ -39,7 +40,10 @@ def _make_sgbm(mode: int) -> MapMatch:
 
 
 def _make_bm() -> MapMatch:
-    """Create a block matcher over 192 disparities, with the sample's settings but a speckle range of 2."""
+    """Create a block matcher over 192 disparities.
+
+    The settings are those of OpenCV's sample program, except for a speckle range of 2.
+    """
     matcher = cv2.StereoBM.create(numDisparities=DISPARITIES, blockSize=9)
     matcher.setPreFilterCap(31)
     matcher.setTextureThreshold(10)
@@ -79,9 +83,10 @@ def fill_rows(disparity_px: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "
 def left_right_confidence(
     disparity_px: Float32[np.ndarray, "h w"], right_disparity_px: Float32[np.ndarray, "h w"]
 ) -> Float32[np.ndarray, "h w"]:
-    """Return the negated left-right disagreement in px: 0 at best; a ranking, not a probability.
+    """Return the negated left-right disagreement in px, which is a ranking and not a probability.
 
-    It is minus infinity where either disparity is a hole (<= 0) or the match lies outside the right view.
+    The best value is 0. The result is minus infinity where either disparity is a hole (<= 0) or the match
+    lies outside the right view.
     """
     width = disparity_px.shape[1]
     matches = np.rint(np.arange(width) - disparity_px).astype(int)

@@ -45,8 +45,8 @@ from stereoweave.system.ray_engine import Engine, stream
 MatchFunction = Callable[[StereoPair], Estimate | Float[np.ndarray, "h w"]]
 """The timed function, which returns an Estimate or only the left disparity in px [H, W], <= 0 in holes.
 
-Holes of such a map are then filled along rows. Its confidence comes from the left-right check, for which the
-mirrored pair is matched too. Neither step is timed, because users may choose methods of other costs.
+Holes in a disparity map are then filled along rows. Confidence comes from the left-right check, for which the
+mirrored pair is also matched. Neither step is timed, because users may choose methods with other costs.
 """
 
 MatcherFactory = Callable[[], MatchFunction]
@@ -103,7 +103,7 @@ class _MatcherOutput(NamedTuple):
 def make_matcher(
     model: str | Path, threads: int | None = None, refined: bool = False, provider: str = CPU
 ) -> MatchFunction:
-    """Return a function that matches as `stereoweave.estimate` does; raises as `Matcher` does."""
+    """Return a function that matches like `stereoweave.estimate`. For errors see `Matcher`."""
     matcher = Backend(model=model, threads=threads, provider=provider).matcher()
     options = MatchOptions(refined=refined)
     return lambda pair: match(matcher, pair, options)
@@ -112,17 +112,17 @@ def make_matcher(
 def score_pairs(
     makers: Mapping[str, MatcherFactory], scenes: SceneLister[Scene], engine: Engine | None = None
 ) -> PairScores:
-    """Score the given matchers and OpenCV's on scenes: errors, times and sparsification curves.
+    """Score the given matchers and OpenCV's matchers on scenes: errors, times and sparsification curves.
 
     Args:
         makers: Factories of the matchers, by name.
-        scenes: Must list at least one scene.
-        engine: Scores each scene on one worker, so that times are compared on one machine; the makers and
-            `scenes` are pickled for it. Default: this process.
+        scenes: Function that lists at least one scene.
+        engine: Engine that scores each scene on one worker, so that times are compared on the same machine;
+            `makers` and `scenes` must be picklable. Default: this process.
 
     Raises:
-        StereoweaveError: If a matcher's name, or the stem of its file, is that of another row of the table,
-            if there are no scenes, or as `engine.stream` does.
+        StereoweaveError: If a matcher's name, or the stem of its file, is the name of another row of the
+            table, or if there are no scenes; see also `engine.stream`.
     """
     everyone = _add_opencv(makers)
     found = score_all(everyone, scenes, _score_scene, engine)
@@ -150,7 +150,7 @@ def score_all(
     For arguments and errors see `score_pairs`.
     """
     make_scorer = partial(_SceneScorer, makers, scenes, score)
-    # Made here even with an engine, so that unknown matchers and scenes raise at once.
+    # Made here even with an engine, so that unknown matchers and scenes cause errors at once.
     scorer = make_scorer()
     count = len(scorer.readers)
     if not count:
@@ -169,7 +169,7 @@ def merge_machines(scored: Iterable[SceneResult[Any]]) -> dict[str, str]:
 def add_memory(
     rows: Iterable[MatcherRow], makers: Mapping[str, MatcherFactory], pair: StereoPair
 ) -> list[MatcherRow]:
-    """Add each matcher's peak memory for a pair to the mean rows, measured in a separate process.
+    """Measure each matcher's peak memory for a pair in a separate process, and add it to the mean rows.
 
     Args:
         rows: Rows of `score_pairs`.
@@ -209,7 +209,9 @@ class _SceneScorer:
 def _add_opencv(makers: Mapping[str, MatcherFactory]) -> dict[str, MatcherFactory]:
     for name in makers:
         if Path(name).stem in (*OPENCV_MATCHERS, MEAN):
-            raise StereoweaveError(f"{name}: expected a name that no other row of the table uses; rename it")
+            raise StereoweaveError(
+                f"{name}: expected a name that no other row of the table uses, found a duplicate; rename it"
+            )
     return {**OPENCV_MATCHERS, **makers}
 
 

@@ -33,7 +33,7 @@ _PLACES: tuple[_Place, ...] = (
 
 
 def draw_error_over_time(path: str | Path, rows: Sequence[MatcherRow]) -> None:
-    """Write plots of bad-1 and EPE against the time per pair, side by side; lower and further left is better.
+    """Write plots of bad-1 and EPE against the time per pair, side by side; the lower left is best.
 
     Args:
         path: Picture to write; its extension selects the format.
@@ -58,7 +58,7 @@ def draw_error_over_time(path: str | Path, rows: Sequence[MatcherRow]) -> None:
 
 
 def draw_sparsification(path: str | Path, curves: Mapping[str, Curves]) -> None:
-    """Write plots of bad-1 and EPE against the share of pixels dropped by confidence; oracles are dashed.
+    """Write plots of bad-1 and EPE against the share of pixels dropped by confidence. Oracles are dashed.
 
     Args:
         path: Picture to write; its extension selects the format.
@@ -72,7 +72,7 @@ def draw_sparsification(path: str | Path, curves: Mapping[str, Curves]) -> None:
             axes.plot(DROPPED_PERCENT, curve.kept, color=colour, linewidth=2, label=_legend_entry(name))
             axes.plot(DROPPED_PERCENT, curve.oracle, color=colour, linewidth=1, linestyle="--")
         axes.set(xlabel="dropped, % of pixels", ylabel=_TITLES[column], xlim=(0, 95), ylim=(0, None))
-    axes.plot([], [], color="0.4", linewidth=1, linestyle="--", label="by its error: the oracle")
+    axes.plot([], [], color="0.4", linewidth=1, linestyle="--", label="by the true error: the oracle")
     axes.legend(loc="upper right", frameon=False)
     _save(figure, path)
 
@@ -102,7 +102,7 @@ def _legend_entry(matcher: str) -> str:
 
 
 def _label(axes: Axes, points: Mapping[str, tuple[float, float]]) -> None:
-    """Write each name beside its point, in its first free place, or in the best one if none is free."""
+    """Write each name beside its point, in the first free place, or in the best place if none is free."""
     corners = [axes.transData.transform(point) for point in points.values()]
     taken = [Bbox([corner - _MARKER_PX / 2, corner + _MARKER_PX / 2]) for corner in corners]
     for name, point in points.items():

@@ -1,9 +1,9 @@
-"""Comparison of methods on one dataset: errors of disparity, and of the right view projected with it.
+"""Comparison of methods on one dataset, by the errors of disparities and of right views projected with them.
 
 These are the columns of Table I of "Fast Depth Estimation for View Synthesis". The paper does not say how its
-view error treats pixels without a source, and a bad disparity can leave many of them. So the error is given
-twice: over the pixels that have a source, with their share, and over all pixels after rows are filled in the
-same way for all methods. The second error ranks the methods.
+view error treats pixels without a source, and a poor disparity map can leave many such pixels. Therefore,
+the error is given twice: over the pixels that have a source, together with their share, and over all pixels
+after rows are filled identically for all methods. The second error ranks the methods.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -30,8 +30,8 @@ class ProjectionErrors:
 
     Attributes:
         mae_sourced: Mean absolute error, in levels of 0..255, over the pixels that have a source.
-        sourced_percent: Share of these pixels.
-        mae_filled: The same over all pixels after `fill_from_rows`; ranks the methods.
+        sourced_percent: Share of the pixels that have a source.
+        mae_filled: Mean absolute error over all pixels after `fill_from_rows`; ranks the methods.
         psnr_db, ssim: Scores of the filled view.
     """
 
@@ -83,7 +83,7 @@ def score_projections(
     everyone: dict[str, DisparityMethod] = {GROUND_TRUTH: _true_px, NO_WARPING: _zero_px, SGBM: _make_sgbm()}
     if taken := everyone.keys() & methods.keys():
         raise StereoweaveError(
-            f"{min(taken)}: expected a name that no other row of the table uses; rename it"
+            f"{min(taken)}: expected a name that no other row of the table uses, found a duplicate; rename it"
         )
     everyone |= methods
     scores = [

@@ -2,7 +2,7 @@
 
 Used for Table I of "Fast Depth Estimation for View Synthesis". `rendering` makes better views, from both
 images. This projection only serves to compare methods: it neither blends nor refines, so the views of two
-methods differ only by their disparity.
+methods differ only because of their disparities.
 """
 
 import numpy as np
@@ -16,7 +16,8 @@ def project_right(left: UInt8[np.ndarray, "h w 3"], disparity_px: Float[np.ndarr
     """Project the left image to the right view; pixels without a source are black and not `drawn`.
 
     Column x of the left image goes to the right image's column nearest to x - disparity_px. Where several
-    pixels land together, the nearest surface wins. The paper only says "projected from the left images".
+    pixels land in the same column, the nearest surface wins. The paper only says
+    "projected from the left images".
 
     Args:
         left: uint8 RGB [H, W, 3].
@@ -37,11 +38,13 @@ def project_right(left: UInt8[np.ndarray, "h w 3"], disparity_px: Float[np.ndarr
 
 
 def fill_from_rows(view: View) -> UInt8[np.ndarray, "h w 3"]:
-    """Fill each pixel that was not drawn with the next drawn pixel on its right, else the last on its left.
+    """Fill the pixels that were not drawn with colours of drawn pixels in the same row.
+
+    The next drawn pixel on the right is used or, if there is none, the last one on the left.
 
     In a right view projected from the left image, nearer surfaces move farther left, so the area that they
     uncover has background on its right. The fill therefore needs no disparity and treats all methods alike. A
-    row without any drawn pixel copies the row above; rows above the first drawn one stay black.
+    row without drawn pixels copies the row above. Rows above the first row with drawn pixels stay black.
     """
     height, width = view.drawn.shape
     after = np.where(view.drawn, np.arange(width), width)

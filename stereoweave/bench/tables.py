@@ -23,7 +23,7 @@ MEAN = "mean"
 class MatcherRow:
     """Scores of one matcher on one scene, or averaged over all scenes (scene "mean").
 
-    Errors cover every pixel of known truth, occluded ones included. A mean is over the scenes that have a
+    Errors cover every pixel of known truth, including occluded pixels. A mean is over the scenes that have a
     value; for example, a scene without depth edges has no edge errors.
 
     Attributes:
@@ -34,8 +34,9 @@ class MatcherRow:
             probability. It is computed per scene, so that overconfidence in one scene does not cancel
             underconfidence in another.
         time_ms: Median time per call after a warm-up; in the mean row, the mean of these medians.
-        time_relative: time_ms as a multiple of SGBM's in the same scene.
-        memory_mb: Peak memory for the largest pair (memory.py); only in the mean row, and if measured.
+        time_relative: time_ms as a multiple of SGBM's time_ms on the same scene.
+        memory_mb: Peak memory for the largest pair (system/memory.py); NaN if not measured, and in all rows
+            except the mean row.
     """
 
     matcher: str
@@ -126,12 +127,12 @@ def average_curves(curves: Sequence[Curves]) -> Curves:
 
 
 def write_csv(path: str | Path, rows: Sequence[Any], machine: dict[str, str] | None = None) -> None:
-    """Write rows as CSV with a header, and with the machine's columns in each row.
+    """Write rows as CSV with a header. Each row also describes the machine.
 
     Args:
         path: The CSV file; its folder is created.
         rows: At least one instance of one dataclass, whose fields are the columns.
-        machine: Processor, number of cores and OpenCV's version. Default: this machine's.
+        machine: Processor, number of cores and OpenCV version. Default: those of this machine.
     """
     machine = machine or describe_machine()
     columns = [field.name for field in fields(rows[0])] + list(machine)
@@ -140,7 +141,7 @@ def write_csv(path: str | Path, rows: Sequence[Any], machine: dict[str, str] | N
 
 
 def describe_machine() -> dict[str, str]:
-    """Return this machine's processor, its number of cores, and OpenCV's version."""
+    """Return this machine's processor, number of cores and OpenCV version."""
     return {"cpu": _find_cpu_name(), "cores": str(os.cpu_count()), "opencv": cv2.__version__}
 
 

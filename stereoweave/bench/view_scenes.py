@@ -24,7 +24,7 @@ class ReferenceView:
     """An image taken by a further camera on the line through the two cameras of the pair.
 
     Attributes:
-        position: 0 is the left camera, 1 the right one.
+        position: Position from -1 to 2; 0 is the left camera and 1 the right one.
         image: uint8 RGB [H, W, 3].
         offset_px: Offset of the image's content from its nominal place, to the right and down.
     """
@@ -39,9 +39,9 @@ class ViewScene:
     """A pair with reference views.
 
     Attributes:
-        name: The folder's name, or SUBFOLDER/ship-000057 in a rendered set.
-        sample: The pair; its disparities are NaN if the scene has none.
-        views: At least one, sorted by position, each of the pair's size.
+        name: The folder's name, or a name such as SUBFOLDER/ship-000057 in a rendered set.
+        sample: The pair; its disparities are NaN if unknown.
+        views: At least one reference view of the same size as the pair, sorted by position.
     """
 
     name: str
@@ -50,7 +50,7 @@ class ViewScene:
 
 
 def read_view_scenes(folder: str | Path) -> Iterator[ViewScene]:
-    """Yield the scenes of `folder` in order of name, each read when it is needed; see `list_view_scenes`."""
+    """Yield the scenes of `folder`, sorted by name and read one at a time; see `list_view_scenes`."""
     return (read() for read in list_view_scenes(folder))
 
 
@@ -60,8 +60,8 @@ def list_view_scenes(folder: str | Path) -> list[Callable[[], ViewScene]]:
     A scene is a folder with left.png, right.png and a view_<position>.png for each further picture. It may
     also have disparity.png (16 bits, pixels * 256, 0 = unknown) or disparity.pfm (NaN or infinity = unknown),
     and right_disparity in the same formats. An optional scene.json gives each picture's offset from its
-    nominal place as "offset_px": {position: [right, down]}. Without such folders, the scenes are the pairs of
-    all rendered sets (`stereoweave synth make`) in and below `folder`.
+    nominal place as "offset_px": {position: [right, down]}. If there are no such folders, the scenes are the
+    pairs of all rendered sets (`stereoweave synth make`) in and below `folder`.
 
     Raises:
         StereoweaveError: If the folder contains no scene.
@@ -75,7 +75,7 @@ def list_view_scenes(folder: str | Path) -> list[Callable[[], ViewScene]]:
     sets = [Shards(path) for path in below if list_shards(path)]
     if not sets:
         raise StereoweaveError(
-            f"{root}: expected <scene>/left.png below it, or rendered sets, found neither; "
+            f"{root}: expected subfolders with left.png, or rendered sets, found neither; "
             "render a set with further views: stereoweave synth make"
         )
     return [
@@ -89,7 +89,7 @@ def _read_rendered_scene(pairs: Shards, index: int, root: Path) -> ViewScene:
     views = tuple(ReferenceView(position=at, image=image) for at, image in sorted(pairs.views(index).items()))
     if not views:
         raise FormatError(
-            f"{folder}: expected further views of every pair, found none of {name}; "
+            f"{folder}: expected further views of every pair, found none for {name}; "
             "render a set with further views: stereoweave synth make"
         )
     return ViewScene(name=name, sample=pairs[index], views=views)
@@ -102,7 +102,7 @@ def _read_scene(folder: Path) -> ViewScene:
     views = [_read_view(path, pair, offsets_px) for path in folder.glob("view_*.png")]
     if not views:
         raise FormatError(
-            f"{folder}: expected an image from between the cameras, such as view_0.5.png, found no view_*.png"
+            f"{folder}: expected a reference picture, such as view_0.5.png, found no view_*.png"
         )
     return ViewScene(
         name=folder.name,
@@ -125,14 +125,14 @@ def _parse_position(path: Path) -> float:
         position = float("nan")
     if not FIRST_POSITION <= position <= LAST_POSITION:
         raise FormatError(
-            f"{path}: expected view_<position>.png with a position of {FIRST_POSITION:g} to "
-            f"{LAST_POSITION:g} (0 is the left camera, 1 the right one), found {text!r}"
+            f"{path}: expected view_<position>.png with a position from {FIRST_POSITION:g} to "
+            f"{LAST_POSITION:g} (0 is the left camera and 1 the right one), found {text!r}"
         )
     return position
 
 
 def _read_disparity(folder: Path, name: str, *, pair: StereoPair) -> Float[np.ndarray, "h w"]:
-    """Read the named disparity from PFM or else PNG; all NaN (unknown) if neither file exists."""
+    """Read the named disparity from a PFM or else a PNG file; all NaN (unknown) if neither exists."""
     readers: dict[str, Callable[[Path], Float[np.ndarray, "h w"]]] = {
         ".pfm": read_pfm,
         ".png": read_disparity_png,
@@ -151,4 +151,4 @@ def _read_offsets(path: Path) -> dict[float, tuple[float, float]]:
             offsets_px = json.loads(read_small(path)).get("offset_px", {})
             return {float(position): (float(x), float(y)) for position, (x, y) in offsets_px.items()}
         except (AttributeError, TypeError) as error:
-            raise ValueError("another form") from error
+            raise ValueError("an unexpected structure") from error

@@ -9,9 +9,10 @@ from stereoweave.bench.opencv_matchers import fill_rows
 from stereoweave.data.samples import find_occluded
 from stereoweave.stereo import Sample
 
-# Neighbours whose disparities differ by at most this are one surface; a larger step is a depth edge.
+# Neighbours whose disparities differ by at most this much are on the same surface; a larger step is an edge.
 _JOINED_PX = 2.0
-# Samples per pixel of a surface, without cracks in a view between the cameras, which magnifies up to 3 times.
+# Samples per pixel of a surface. They leave no cracks in a view between the cameras, which magnifies surfaces
+# up to 3 times.
 _SAMPLES_A_PIXEL = 4
 
 
@@ -20,8 +21,8 @@ class ViewTruth:
     """Ground truth of a new view; arrays are [H, W].
 
     Attributes:
-        disparity_px: Disparity between the left and the right image of the surface in each pixel; NaN where
-            no pixel of known disparity lands.
+        disparity_px: Disparity, from the left to the right image, of the surface in each pixel; NaN where no
+            pixel of known disparity lands.
         one_sees: Mask of pixels of known disparity that only one of the two images shows.
         none_sees: Mask of pixels that neither image shows, after `fill_unknown` has filled unknown disparity.
     """
@@ -35,8 +36,8 @@ def find_view_truth(sample: Sample, position: float) -> ViewTruth:
     """Return a view's ground truth: the nearest surface that lands on each pixel from either image.
 
     Args:
-        sample: Needs both disparities; pixels of unknown disparity never count as occluded.
-        position: 0 is the left camera, 1 the right one.
+        sample: Sample with both disparities; pixels of unknown disparity never count as occluded.
+        position: Position of the view; 0 is the left camera and 1 the right one.
     """
     sides = (sample.disparity_px, 0 - position), (sample.right_disparity_px, 1 - position)
     disparity_px = np.fmax(*(land_disparities(side_px, way) for side_px, way in sides))
@@ -51,7 +52,7 @@ def land_disparities(disparity_px: Float[np.ndarray, "h w"], way: float) -> Floa
     """Return the disparity of the nearest surface at each pixel of a view [H, W]; NaN where nothing lands.
 
     Args:
-        disparity_px: Disparity of an input image; NaN is unknown.
+        disparity_px: Disparity of an input image; NaN where unknown.
         way: Shift per disparity: column x lands on the pixel nearest to x + way * disparity_px.
     """
     height, width = disparity_px.shape
@@ -69,7 +70,7 @@ def land_disparities(disparity_px: Float[np.ndarray, "h w"], way: float) -> Floa
 
 def fill_unknown(disparity_px: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
     """Fill NaN with the farther of the known neighbours along the row, as `fill_rows` does."""
-    # `fill_rows` takes 0 for unknown, but 0 is the sky's true disparity.
+    # `fill_rows` treats 0 as unknown, but 0 is the true disparity of the sky.
     lift_px = 1 - np.min(disparity_px, where=np.isfinite(disparity_px), initial=0)
     return fill_rows(np.nan_to_num(disparity_px + lift_px).astype(np.float32)) - lift_px
 

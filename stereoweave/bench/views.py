@@ -50,10 +50,10 @@ class ViewScoreRow:
 
     Attributes:
         psnr_db, ssim, mae: Scores over all pixels; mae is in levels of 0..255.
-        smooth_psnr_db, edge_psnr_db, one_psnr_db, neither_psnr_db: PSNR over the pixels of one kind (see the
-            list above); NaN if there are none or the truth is unknown.
+        smooth_psnr_db, edge_psnr_db, one_psnr_db, neither_psnr_db: PSNR over the pixels of one kind (see
+            views.py); NaN if there are none or the truth is unknown.
         smooth_mae, edge_mae, one_mae, neither_mae: Mean absolute error over the same pixels.
-        time_ms: Median time per view, without the matching of the pair.
+        time_ms: Median time per view, excluding the matching of the pair.
     """
 
     scene: str
@@ -74,7 +74,7 @@ class ViewScoreRow:
 
 
 class ViewScores(NamedTuple):
-    """Rows per scene, position and method, then a mean row per method, and a description of the machine."""
+    """A row per scene, position and method, then a mean row per method, and the machine's description."""
 
     rows: list[ViewScoreRow]
     machine: dict[str, str]
@@ -90,13 +90,13 @@ def score_view_scenes(
 
     Every table has four baselines. "nearest photograph" and "cross-fade", the weighted mean of both images,
     need no disparity. "sgbm" uses the disparity of OpenCV's matcher. "ground truth" uses the true disparity
-    of both views, where known, and is an upper bound. Both disparities are filled along rows, and rendered
-    like the networks' estimates.
+    of both views, where known, and is an upper bound. The disparities of these two baselines are filled along
+    rows, and views are rendered as for the networks' estimates.
 
     Args:
         networks: Factories of further methods, by name.
-        scenes: Must list at least one scene.
-        threads: Threads for rendering; default: all cores.
+        scenes: Function that lists at least one scene.
+        threads: Number of threads for rendering. Default: all cores.
         engine: See `score_pairs`, also for the errors raised.
     """
     found = score_all(networks, scenes, partial(_score_scene, threads), engine)
@@ -176,7 +176,7 @@ def _estimate_by_sgbm(pair: StereoPair) -> Estimate:
     return Estimate(
         disparity_px=filled_px,
         right_disparity_px=right_filled_px,
-        # As `Matcher` does for a network without a confidence output.
+        # The same formula as in `Matcher` for a network without a confidence output.
         confidence=np.exp(left_right_confidence(left_px, mirrored_px[:, ::-1])),
         occluded=find_occluded(filled_px, right_filled_px),
     )

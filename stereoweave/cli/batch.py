@@ -29,7 +29,7 @@ Source = Annotated[
     ),
 ]
 Destination = Annotated[
-    str, typer.Argument(help="Folder or URL for the results: new, or that of a batch to resume.")
+    str, typer.Argument(help="Folder or URL for the results, either new or from a batch to resume.")
 ]
 Address = Annotated[
     str | None,

@@ -28,7 +28,7 @@ from stereoweave.cli.tables import (
     write_and_print,
 )
 
-# Suffix of a network's name when its estimate is refined.
+# Suffix of a network's name if its estimates are refined.
 REFINED = " refined"
 
 Classes = Annotated[
@@ -36,13 +36,13 @@ Classes = Annotated[
     typer.Option(
         metavar="FILE",
         help="Additional CSV file to write: errors by class of pixel (outside the right picture, occluded, "
-        "near edges, plain, weakly textured, textured).",
+        "near edges, plain, weakly textured and textured).",
     ),
 ]
 ScenesFolder = Annotated[
     Path,
     typer.Argument(
-        help="Folder with a subfolder per scene, which contains left.png, right.png and disparity.png; "
+        help="Folder with a subfolder per scene that contains left.png, right.png and disparity.png; "
         "or a set made by synth make."
     ),
 ]
@@ -140,7 +140,7 @@ def views(  # noqa: PLR0913 - each is an option of the command line
     folder: Annotated[
         Path,
         typer.Argument(
-            help="Folder with a subfolder per scene, which contains left.png, right.png and one or more "
+            help="Folder with a subfolder per scene that contains left.png, right.png and one or more "
             "view_<position>.png; or a set made by synth make --view."
         ),
     ],
@@ -217,7 +217,7 @@ def networks(
 ) -> None:
     """Score trained networks on their held-out pairs.
 
-    Scores cover disparity, and the right views projected with it.
+    Scores cover the disparities and the right views projected with them.
     """
     from rich.console import Console
 
@@ -258,7 +258,7 @@ def training(
 ) -> None:
     """Record a run's learning curve, and fit power laws to it.
 
-    The curve is held-out scores against the number of pairs seen.
+    The curve shows held-out scores against the number of pairs seen.
     """
     make_parent_folder(out)
     with require_train_extra():
@@ -270,7 +270,7 @@ def training(
 def _list_makers(
     models: Sequence[str] | None, threads: int | None, provider: str
 ) -> dict[str, Callable[[], Any]]:
-    """Return factories of the named networks, plain and refined; default: all shipped networks."""
+    """Return factories of the named networks, plain and refined. Default: all shipped networks."""
     from stereoweave.bench.pairs import make_matcher
     from stereoweave.matching.matcher import MODES, shipped_models
 

@@ -1,4 +1,4 @@
-"""Names of the running command's options, which its errors and notes use for settings."""
+"""Names of the running command's options, used for settings in error messages and notes."""
 
 from collections.abc import Callable
 from contextvars import ContextVar
@@ -10,7 +10,7 @@ from typer.core import TyperCommand
 
 from stereoweave.errors import NameOf, StereoweaveError, keyword
 
-# Parameters of commands, by setting, where the two names differ.
+# Parameters of commands, by setting, where the parameter has another name.
 _PARAMETERS = {
     "calibration": "calib",
     "convergence_px": "convergence",
@@ -33,7 +33,7 @@ class OptionNames:
     options: dict[str, str]
 
     def __call__(self, setting: str) -> str | None:
-        """Return the option that sets a setting; None if the command has none."""
+        """Return the name of the option for a setting; None if the command has no such option."""
         return self.options.get(setting) or self.options.get(_PARAMETERS.get(setting, ""))
 
 
@@ -52,10 +52,10 @@ def running_options() -> NameOf:
 
 
 class Command(TyperCommand):
-    """A command whose errors name settings by the command's options."""
+    """A command whose error messages refer to settings by the names of its options."""
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the command, and name settings by its options in errors."""
+        """Run the command. Error messages refer to settings by the names of its options."""
         names = option_names(self)
         token = _running.set(names)
         try:

@@ -48,10 +48,10 @@ PicturesOrFolder = Annotated[
 ]
 Left = Annotated[
     str | None,
-    typer.Option(metavar="GLOB", help="Quoted pattern of the left pictures, such as 'left/*.png'."),
+    typer.Option(metavar="GLOB", help="Quoted pattern for the left pictures, such as 'left/*.png'."),
 ]
 Right = Annotated[
-    str | None, typer.Option(metavar="GLOB", help="Quoted pattern of the right pictures, in the same order.")
+    str | None, typer.Option(metavar="GLOB", help="Quoted pattern for the right pictures, in the same order.")
 ]
 Listed = Annotated[
     Path | None,

@@ -49,7 +49,7 @@ def live(  # noqa: PLR0913 - each is an option of the command line
     arrangement: OldFormat = None,
 ) -> None:
     """Show live video and its depth in colour on a web page. Ctrl-C stops it."""
-    # Otherwise FFmpeg would print its own message besides our error.
+    # Otherwise, FFmpeg would print its own message in addition to our error.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     from stereoweave.app.capture import Capture
     from stereoweave.app.live import LiveTally, show
@@ -61,8 +61,8 @@ def live(  # noqa: PLR0913 - each is an option of the command line
     format = replace_old_option(("--arrangement", arrangement), ("--format", format))
     if format not in (None, *PAIR_LAYOUTS) or (format and len(sources) > 1):
         raise StereoweaveError(
-            f"expected one of {', '.join(PAIR_LAYOUTS)}, for frames of one source with both views, "
-            f"found {format} of {' '.join(sources)}",
+            f"expected one of {', '.join(PAIR_LAYOUTS)}, for a single source with both views in each frame, "
+            f"found {format} for {' '.join(sources)}",
             setting="format",
         )
     rig = read_rig(calib) if calib else None

@@ -30,7 +30,7 @@ Format = Annotated[
         "--format",
         help="Layout of a picture that holds both views: side_by_side, side_by_side_half, crossed, "
         "crossed_half, top_bottom, top_bottom_half, top_bottom_right_first, top_bottom_right_first_half, "
-        "mpo, jps (default: detected).",
+        "mpo or jps (default: detected).",
     ),
 ]
 OldFormat = Annotated[str | None, typer.Option("--arrangement", hidden=True, help="Old name of --format.")]
@@ -80,7 +80,7 @@ Strength = Annotated[float, typer.Option(min=0, help="Factor that scales the bas
 Model = Annotated[
     str,
     typer.Option(
-        help="Shipped network (small or base), or an .onnx matcher file. For stills also best, which runs "
+        help="Shipped network (small or base), or an .onnx matcher file. For stills, also best, which runs "
         "base a second time at 1.5 times the size and refines the result."
     ),
 ]
@@ -97,8 +97,8 @@ Cluster = Annotated[
 Provider = Annotated[
     str,
     typer.Option(
-        help="Hardware that runs the network: cpu; cuda or tensorrt (NVIDIA GPUs), openvino (Intel "
-        "processors), coreml (macOS), directml (Windows). If a provider's package is missing, the error "
+        help="Hardware that runs the network: cpu, cuda or tensorrt (NVIDIA GPUs), openvino (Intel "
+        "processors), coreml (macOS) or directml (Windows). If a provider's package is missing, the error "
         "names it."
     ),
 ]
@@ -106,7 +106,8 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON."
 Host = Annotated[
     str,
     typer.Option(
-        help="Address to listen on: 127.0.0.1 accepts only this computer, 0.0.0.0 any that can reach it."
+        help="Address to listen on: 127.0.0.1 accepts only this computer; 0.0.0.0 accepts any computer that "
+        "can reach it."
     ),
 ]
 Port = Annotated[int, typer.Option(min=0, max=65535, help="Port to listen on; 0 takes any free port.")]
@@ -117,7 +118,7 @@ def replace_old_option(old: tuple[str, str | None], new: tuple[str, str | None])
 
     Args:
         old: The old name and the value given with it, if any.
-        new: The same for the new name.
+        new: The new name and the value given with it, if any.
 
     Raises:
         StereoweaveError: If both are given.
@@ -126,7 +127,7 @@ def replace_old_option(old: tuple[str, str | None], new: tuple[str, str | None])
     if old_value is None:
         return new_value
     if new_value is not None:
-        raise StereoweaveError(f"{old_name}: expected only {new_name}, its new name, found both")
+        raise StereoweaveError(f"{old_name}: expected only {new_name}, which replaces {old_name}, found both")
     typer.echo(f"stereoweave: warning: {old_name} is deprecated; use {new_name}", err=True)
     return old_value
 
@@ -177,7 +178,7 @@ def _parse_two_numbers(option: str, text: str, expected: str) -> tuple[float, fl
 
 
 def make_engine(cluster: str | None, workers: int | None = None, cpus_each: float = 1) -> "Engine | None":
-    """Return the cluster to run on; None without --cluster."""
+    """Return the cluster to run on; None if --cluster is not given."""
     from stereoweave.system.ray_engine import Engine
 
     return Engine(cluster, workers, cpus_each) if cluster else None
@@ -207,7 +208,7 @@ def listen(host: str, port: int) -> socket.socket:
         # create_server appends the address to the system's text.
         found = reason(error).partition(" (while attempting")[0]
         raise StereoweaveError(
-            f"--host {host} --port {port}: expected a free address, found {found}; "
+            f"--host {host} --port {port}: expected a free address, found none ({found}); "
             "--port 0 takes any free port"
         ) from error
 
@@ -218,7 +219,7 @@ def format_url(host: str, port: int) -> str:
 
 
 def find_allowed_hosts(listener: socket.socket, host: str) -> tuple[str, ...] | None:
-    """Return the names allowed in the header Host; None (any) if other machines can reach the listener.
+    """Return the names allowed in the header Host; None, for any, if other machines can reach the listener.
 
     This prevents DNS rebinding, where a foreign site's name is made to resolve to this machine's address.
 

@@ -37,12 +37,12 @@ def check(pictures: Pictures, format: Format = None, as_json: AsJson = False) ->
 
 
 def _name_remedy(setting: str) -> str | None:
-    """Return the option of `check` that sets a setting; for rectification, the command that does it."""
+    """Return the option of `check` for a setting; for rectification, the command that rectifies."""
     return "stereoweave rectify" if setting == "rectify" else running_options()(setting)
 
 
 def _replace_nan(value: object) -> object:
-    """Replace NaN, which means unknown, by None, which JSON writes as null."""
+    """Replace NaN, which means unknown, with None, which JSON writes as null."""
     if isinstance(value, tuple):
         return [_replace_nan(part) for part in value]
     return None if isinstance(value, float) and math.isnan(value) else value
@@ -93,7 +93,7 @@ def _check_output(pictures: Sequence[Path], calib: Path | None, out: Path) -> No
     if calib is None and (out / "calib.yml").exists():
         raise StereoweaveError(
             f"{out / 'calib.yml'}: expected no file, because pictures rectified without --calib have no "
-            "calibration, found an older one; choose another --out"
+            "calibration, found an older file; choose another --out"
         )
 
 
@@ -101,8 +101,8 @@ def calibrate(  # noqa: PLR0913 - each is an option of the command line
     folder: Annotated[
         Path,
         typer.Argument(
-            help="Folder with at least 5 pairs of pictures of a board, in left and right, or as left_01, "
-            "right_01."
+            help="Folder with at least 5 pairs of pictures of a board, in the subfolders left and right or "
+            "named left_01, right_01."
         ),
     ],
     out: Annotated[

@@ -131,7 +131,7 @@ def serve(  # noqa: PLR0913 - each is an option of the command line
 
 
 def _hosts(listener: socket.socket, host: str, behind_proxy: bool) -> tuple[str, ...] | None:
-    """Return the values allowed in the Host header; None if a proxy checks it."""
+    """Return the values allowed in the Host header; None if a proxy checks the header."""
     if behind_proxy:
         return None
     names = find_allowed_hosts(listener, host)

@@ -26,12 +26,12 @@ def make(  # noqa: PLR0913 - each is an option of the command
     scene: Scene,
     pairs: Annotated[int, typer.Option(min=1, help="Number of pairs in the finished set.")],
     out: Annotated[
-        Path, typer.Option("--out", "-o", help="Folder of the set, new or to be resumed or extended.")
+        Path, typer.Option("--out", "-o", help="Folder of the set: a new one, or one to resume or extend.")
     ],
     seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 0,
     size: Annotated[str, typer.Option(help="Width and height in pixels.")] = "640x480",
     plain: Annotated[
-        bool, typer.Option("--plain", help="Render faster, without shadows, gloss and other effects.")
+        bool, typer.Option("--plain", help="Render faster, without shadows, gloss or other effects.")
     ] = False,
     layout: Annotated[
         str,
@@ -43,7 +43,8 @@ def make(  # noqa: PLR0913 - each is an option of the command
     view: Annotated[
         list[float] | None,
         typer.Option(
-            help="Position of an additional view, -1 to 2; 0.5 is halfway between the cameras. Repeatable."
+            help="Position of an additional view, from -1 to 2; 0.5 is halfway between the cameras. "
+            "Repeatable."
         ),
     ] = None,
     rig: Annotated[

@@ -72,12 +72,12 @@ VIEWS_TABLES = {
 
 
 def print_means(tables: Mapping[str, Mapping[str, str]], who: str, rows: Sequence[Any]) -> None:
-    """Print rows in several tables, because a single one would be wider than a terminal.
+    """Print rows in several tables, because a single table would be wider than a terminal.
 
     Args:
         tables: Fields of the rows, by title and column heading.
         who: Field that names a row.
-        rows: Dataclasses of one type.
+        rows: Dataclasses of the same type.
     """
     from rich.console import Console
     from rich.table import Column, Table

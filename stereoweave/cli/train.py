@@ -12,7 +12,7 @@ from stereoweave.errors import StereoweaveError
 
 def train(
     recipe: Annotated[Path, typer.Argument(help="Recipe in TOML, such as recipes/weave_small.toml.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the run, new or to be resumed.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the run: a new one, or one to resume.")],
 ) -> None:
     """Train the network of a recipe, or resume an interrupted run."""
     from stereoweave.learn.distributed import report_once
@@ -20,7 +20,7 @@ def train(
     with report_once(), require_train_extra():
         from stereoweave.learn.recipe import read_recipe
 
-        read_recipe(recipe)  # reports errors before PyTorch, which takes seconds to load
+        read_recipe(recipe)  # reports errors before PyTorch is loaded, which takes seconds
     with require_train_extra():
         from stereoweave.learn.training.loop import train as train_recipe
     train_recipe(recipe, out)
@@ -61,9 +61,9 @@ def export(  # noqa: PLR0913 - each is an option of the command line
 ) -> None:
     """Export a trained network as matcher files for --model.
 
-    The files are checked to agree with the network on stereo pairs.
+    Each file is checked to agree with the network on stereo pairs.
     Variants in 16 bits, in 8 bits or for one size are made from a trained network or from a matcher file.
-    Each is compared with its source, and rejected if it differs too much.
+    Each variant is compared with its source, and rejected if it differs too much.
     """
     from stereoweave.data.readers import read_scenes
 

@@ -54,7 +54,9 @@ Depth16 = Annotated[
 ]
 Position = Annotated[
     float | None,
-    typer.Option(help="Write the view from this position, -1 to 2: 0 is the left camera, 1 the right one."),
+    typer.Option(
+        help="Write the view from this position, from -1 to 2; 0 is the left camera and 1 the right one."
+    ),
 ]
 Layout = Annotated[
     str | None,
@@ -151,8 +153,8 @@ def _parse_rate(rate: str) -> Fraction:
         fraction = Fraction(0)
     if not 0 < fraction <= _HIGHEST_RATE:
         raise StereoweaveError(
-            "--rate: expected frames per second, such as 24 or 30000/1001, "
-            f"at most {_HIGHEST_RATE}, found {rate!r}"
+            f"--rate: expected frames per second above 0 and at most {_HIGHEST_RATE}, such as 24 or "
+            f"30000/1001, found {rate!r}"
         )
     return fraction
 

@@ -43,19 +43,20 @@ Out = Annotated[
 Position = Annotated[
     float | None,
     typer.Option(
-        help="Viewpoint of a single view, -1 to 2: 0 is the left camera, 1 the right one (default: 0.5)."
+        help="Viewpoint of a single view, from -1 to 2; 0 is the left camera and 1 the right one (default: "
+        "0.5)."
     ),
 ]
-Up = Annotated[float, typer.Option(help="Height of a single view's viewpoint, in baselines, -1 to 1.")]
+Up = Annotated[float, typer.Option(help="Height of a single view's viewpoint in baselines, from -1 to 1.")]
 Forward = Annotated[
-    float, typer.Option(help="Forward shift of a single view's viewpoint, in baselines, -1 to 1.")
+    float, typer.Option(help="Forward shift of a single view's viewpoint in baselines, from -1 to 1.")
 ]
 Layout = Annotated[
     str | None,
     typer.Option(
         help="Layout of several views in one picture: side_by_side, side_by_side_half, crossed, top_bottom, "
         "top_bottom_half, anaglyph_grey, anaglyph_colour, anaglyph_half_colour, anaglyph_dubois, rgbd, "
-        "quilt, contact_sheet; or an animation, sweep or wiggle, as .mp4 (extra 'video'), .gif or .webp."
+        "quilt or contact_sheet; or an animation, sweep or wiggle, as .mp4 (extra 'video'), .gif or .webp."
     ),
 ]
 Convergence = Annotated[
@@ -153,7 +154,7 @@ def _check_has_views(name: str | None) -> None:
     """Raise a StereoweaveError if the layout has no views that strength and convergence could shift."""
     if name == "rgbd":
         raise StereoweaveError(
-            "--strength, --convergence: expected with a layout of several views, found with rgbd"
+            "--strength, --convergence: expected only with a layout of several views, found with rgbd"
         )
 
 

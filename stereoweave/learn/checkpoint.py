@@ -23,10 +23,10 @@ class Checkpoint:
         weights: The network's current weights.
         averaged: Running average of the weights, which is scored and exported.
         optimiser: The optimiser's state; empty in a checkpoint that only serves to start other runs.
-        random_state: PyTorch's random state. Every other draw depends on (seed, step) alone.
+        random_state: PyTorch's random state. All other random numbers depend only on (seed, step).
         scores: Scores of the last validation.
         commit: Commit of the code that trained the network.
-        hours: Training time so far, including restarts and the runs that this one descends from.
+        hours: Training time so far, including restarts and the runs that this run descends from.
         origin: Recipe, step and commit of each checkpoint that the run descends from, oldest first.
     """
 
@@ -49,10 +49,10 @@ class Checkpoint:
 def make_initial(recipe: Recipe, commit: str) -> Checkpoint:
     """Make the first checkpoint of a new run.
 
-    Weights take the averaged values of `start_from` where name and shape match; all others are random.
+    Weights whose name and shape match take the averaged values of `start_from`; all others are random.
 
     Raises:
-        FormatError: `start_from` is not a checkpoint, or shares no weights with the network.
+        FormatError: If `start_from` is not a checkpoint, or shares no weights with the network.
     """
     torch.manual_seed(recipe.seed)
     weights: Weights = build_network(recipe).state_dict()
@@ -76,7 +76,7 @@ def make_initial(recipe: Recipe, commit: str) -> Checkpoint:
 
 
 def _take_weights(fresh: Weights, earlier: Checkpoint, recipe: Recipe) -> Weights:
-    """Return the earlier run's averaged weights where name and shape match, else the fresh ones."""
+    """Return the earlier run's averaged weights where name and shape match, else the fresh weights."""
     taken = {
         name: value.to(fresh[name].dtype)  # a stripped checkpoint is in half precision
         for name, value in earlier.averaged.items()
@@ -84,8 +84,8 @@ def _take_weights(fresh: Weights, earlier: Checkpoint, recipe: Recipe) -> Weight
     }
     if not taken:
         raise FormatError(
-            f"{recipe.name}: start_from = {recipe.start_from!r}, expected a checkpoint that shares weights "
-            f"with {recipe.model}, found one of {earlier.recipe.model}"
+            f"{recipe.name}: start_from: expected a checkpoint that shares weights with {recipe.model}, "
+            f"found {recipe.start_from!r}, a checkpoint of {earlier.recipe.model}"
         )
     return fresh | taken
 
@@ -99,19 +99,19 @@ def strip_to_average(kept: Checkpoint) -> Checkpoint:
 
 
 def average(first: Checkpoint, second: Checkpoint, start: Checkpoint) -> Checkpoint:
-    """Average two runs that both started from `start`, to start a further run from the result.
+    """Average two runs that started from `start`. A further run can start from the result.
 
     The mean of two networks fine-tuned from the same weights is often better than either (Wortsman et al.,
     "Model soups", ICML 2022). Running variances are averaged too.
 
     Raises:
-        FormatError: One of the two runs did not start from `start`.
+        FormatError: If one of the two runs did not start from `start`.
     """
     for run in (first, second):
         if _list_origins(run.origin) != _list_origins(start.as_origin()):
             raise FormatError(
                 f"{run.recipe.name}: expected a run that started from {start.recipe.name} after {start.step} "
-                "steps, found one with a different origin"
+                "steps, found a run with a different origin"
             )
     weights = {name: _midpoint(value, second.averaged[name]) for name, value in first.averaged.items()}
     return replace(
@@ -167,7 +167,7 @@ def load(path: Path) -> Checkpoint:
 
 
 def find_commit() -> str:
-    """Return the commit of the running code, with a '+' if files were changed; 'unknown' outside git."""
+    """Return the commit of the running code, with a '+' if files differ; 'unknown' outside a repository."""
     try:
         # Only in this package's own repository: an installed package may lie inside an unrelated one.
         described = subprocess.run(

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from stereoweave.errors import StereoweaveError
 from stereoweave.system.threads import usable_cores
 
-# Delay of errors that another rank's failure may have caused: once that rank exits, torchrun ends the others.
+# Delay of errors that another rank's failure may have caused: when that rank exits, torchrun stops the rest.
 _PATIENCE_S = 20.0
 
 
@@ -22,7 +22,7 @@ class ProcessRank:
     local_world_size: int = 1
 
     def own_micro_batches(self, count: int) -> range:
-        """Return this rank's share of a step's `count` micro-batches as indices; shares do not overlap."""
+        """Return the indices of this rank's share of `count` micro-batches. Shares do not overlap."""
         own = count // self.world_size
         return range(self.rank * own, (self.rank + 1) * own)
 
@@ -39,7 +39,7 @@ def report_once() -> Iterator[None]:
     """Report an error only once, from rank 0 if it occurs in every rank.
 
     The other ranks, and rank 0 after a connection error, wait for 20 s before the error leaves the block. By
-    then torchrun has usually ended them, because another rank failed first.
+    then, torchrun has usually stopped these processes, because another rank failed first.
     """
     try:
         yield
@@ -52,7 +52,7 @@ def report_once() -> Iterator[None]:
 
 
 def choose_thread_count() -> int | None:
-    """Return this process's equal share of the cores as its number of threads; None for PyTorch's default.
+    """Return this process's number of threads, an equal share of the cores; None for PyTorch's default.
 
     The result is None in a single process, and if OMP_NUM_THREADS is above 1. A value of 1 does not count as
     the user's choice, because torchrun sets it by default on any machine.

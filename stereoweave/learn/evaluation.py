@@ -27,8 +27,8 @@ _MEDIAN_PAIRS, _MEDIAN_STRIDE = 400, 8
 def evaluate(runs: Sequence[Path], folder: Path, console: Console) -> list[ProjectionRow]:
     """Score each run on all its held-out pairs, and baselines on the same pairs.
 
-    The baselines come first: ground truth, no warping, SGBM and "median". The last one predicts the median
-    disparity of the training pairs everywhere, so it scores like a network that ignores the images.
+    The baselines come first: ground truth, no warping, SGBM and "median". The last baseline predicts the
+    median disparity of the training pairs everywhere, like a network that ignores the images.
 
     Args:
         runs: Run folders of `stereoweave train`, or checkpoints, all with the same held-out pairs.
@@ -36,7 +36,7 @@ def evaluate(runs: Sequence[Path], folder: Path, console: Console) -> list[Proje
         console: Console that shows progress while pairs are made.
 
     Raises:
-        StereoweaveError: The runs have different held-out pairs, or two rows would have the same name.
+        StereoweaveError: If the runs have different held-out pairs, or two rows would have the same name.
     """
     names = [run.name if run.is_dir() else run.stem for run in runs]
     _check_names(names)
@@ -84,7 +84,9 @@ def make_median_method(training: PairSource) -> DisparityMethod:
 def _check_names(names: Sequence[str]) -> None:
     rows = [MEDIAN, *names]
     if twice := [name for name in names if rows.count(name) > 1]:
-        raise StereoweaveError(f"{twice[0]}: expected a unique name other than {MEDIAN!r}; rename the run")
+        raise StereoweaveError(
+            f"{twice[0]}: expected a unique name other than {MEDIAN!r}, found a duplicate; rename the run"
+        )
 
 
 def _find_common_recipe(networks: dict[str, Checkpoint]) -> Recipe:
@@ -95,7 +97,7 @@ def _find_common_recipe(networks: dict[str, Checkpoint]) -> Recipe:
         if pairs[name] != pairs[first]:
             raise StereoweaveError(
                 f"{name}: expected the held-out pairs of {first}, {pairs[first]}, found {pairs[name]}; "
-                "score it separately"
+                "score this run separately"
             )
     return networks[first].recipe
 

@@ -11,10 +11,10 @@ from pydantic import BeforeValidator, ConfigDict, Field, TypeAdapter, Validation
 from stereoweave.errors import FormatError
 from stereoweave.io.files import read_small, reading
 
-# Characters of a recipe. The longest shipped one has 1,064. For a key with many dots, tomllib takes quadratic
-# time.
+# Maximum number of characters in a recipe. The longest shipped recipe has 1,064. tomllib takes quadratic time
+# for a key with many dots.
 _LONGEST = 10_000
-# Characters of a value that an error quotes.
+# Maximum number of characters of a value that an error quotes.
 _LONGEST_VALUE = 100
 # TOML limits whole numbers to 64 bits, but tomllib also reads larger ones.
 _MOST = 2**63 - 1
@@ -60,31 +60,32 @@ class Recipe:
     Attributes:
         name: Name of the run and of the network.
         model: Key of MODELS.
-        seed: Seed of the initial weights, the pairs and all other random draws.
+        seed: Seed of the initial weights, the pairs and all other random numbers.
         start_from: Checkpoint whose averaged weights initialise all weights of the same name and shape; the
             other weights are random. If it is empty, all weights are random.
         steps: Total number of optimiser steps.
         batch: Pairs per step.
-        micro_batch: Pairs per forward pass, over which batch norm takes its statistics; a step uses the mean
-            gradient of its micro-batches. 0 means the whole batch.
-        learning_rate: Peak learning rate, which follows a linear warm-up and precedes a linear cool-down.
+        micro_batch: Pairs per forward pass, over which batch norm computes its statistics. A step uses the
+            mean gradient of its micro-batches. 0 means the whole batch.
+        learning_rate: Peak learning rate, reached by a linear warm-up and followed by a linear cool-down.
         warm_up_steps: Number of steps at the start in which the learning rate rises.
         cool_down_steps: Number of steps at the end in which the learning rate falls.
         weight_decay: Weight decay of AdamW; 0 selects Adam.
         averaged_steps: Length of the running average of the weights, which validation and export use. A
-            longer average lags behind, a shorter one keeps the noise of single batches; 1 disables averaging.
+            longer average lags behind, and a shorter average keeps the noise of single batches. 1 disables
+            averaging.
         dataset: "collage" or a key of DATASETS.
         root: Folder of the unpacked dataset; empty for collage.
         mix: Training sets that replace the dataset, with their relative weights. A set is "collage" or a
             folder of rendered pairs (data/shards.py). Validation still uses the dataset.
-        split: Key of SPLITS (data/splits.py), which divides frames into training and held-out ones.
+        split: Key of SPLITS (data/splits.py), which divides frames into training and held-out frames.
         pairs: Number of collage pairs to cache; every step crops them differently.
         fresh: Paint a new collage for each draw instead of caching pairs.
         pair_size: Height and width of a collage pair.
         crop_size: Height and width of the crops that a step trains on.
         augment: Also scale, mirror and recolour crops.
         offset_share: Share of pairs whose right crop is shifted to the right, which increases disparity.
-        validation_pairs: Number of pairs to validate on: collages of another seed, or held-out frames.
+        validation_pairs: Number of pairs to validate on: collages with another seed, or held-out frames.
         held_out: Further validation sets, each with its name and its folder of rendered pairs.
         validate_every: Steps between validations; a checkpoint is written after each.
         loss: Key of LOSSES: "weave" for WeaveNet; for all other networks, a loss that compares codes.
@@ -98,7 +99,7 @@ class Recipe:
         distribution: Weight of WeaveNet's cross-entropy over disparity levels; 0 for regression only.
         robust: Share of the logarithm in WeaveNet's regression loss, which reduces the effect of large
             errors.
-        vgg16_weights: File of VGG-16 weights for the perceptual loss.
+        vgg16_weights: File with VGG-16 weights for the perceptual loss.
     """
 
     __pydantic_config__ = ConfigDict(extra="forbid")
@@ -159,7 +160,8 @@ def read_recipe(path: Path) -> Recipe:
     """Read a recipe from a TOML file.
 
     Raises:
-        FormatError: The file is unreadable, or a key is unknown, missing, of the wrong type or out of range.
+        FormatError: If the file is unreadable, or if a key is unknown, missing, of the wrong type or out of
+            range.
     """
     with reading(path, "a recipe in TOML"):
         text = read_small(path).decode()
@@ -173,7 +175,7 @@ def parse_recipe(values: dict[str, Any], source: str) -> Recipe:
     """Make a recipe from a dictionary of its values.
 
     Raises:
-        FormatError: The values are invalid; the message begins with `source`.
+        FormatError: If the values are invalid; the message begins with `source`.
     """
     try:
         recipe = _RECIPES.validate_python(values)

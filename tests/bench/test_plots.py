@@ -70,7 +70,7 @@ def test_each_confidence_has_its_curve_and_its_oracle_in_one_colour(tmp_path, dr
         np.testing.assert_array_equal(kept.get_xdata(), np.arange(96))
         assert kept.get_color() == oracle.get_color() != other_kept.get_color()
     legend = [text.get_text() for text in drawn[0].axes[1].get_legend().get_texts()]
-    assert legend == ["small", "sgbm, by its left-right check", "by its error: the oracle"]
+    assert legend == ["small", "sgbm, by its left-right check", "by the true error: the oracle"]
 
 
 def test_a_matcher_of_unknown_error_is_left_out_and_any_kind_of_picture_is_written(tmp_path):

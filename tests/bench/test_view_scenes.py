@@ -78,14 +78,15 @@ def test_the_pairs_of_rendered_sets_below_a_folder_are_scenes_with_their_views(t
 
 
 def test_a_folder_without_scenes_is_refused(tmp_path):
-    with pytest.raises(StereoweaveError, match="expected <scene>/left.png below it, or rendered sets, found"):
+    with pytest.raises(StereoweaveError, match="expected subfolders with left.png, or rendered sets, found"):
         read_view_scenes(tmp_path)
 
 
 def test_a_set_without_views_is_named(tmp_path):
     write_shard(tmp_path, "ship", 0, [pack(box_before_a_wall(np.random.default_rng(0)), {})])
     with pytest.raises(
-        FormatError, match="further views of every pair, found none of ship-000000; render a set with further"
+        FormatError,
+        match="further views of every pair, found none for ship-000000; render a set with further",
     ):
         next(read_view_scenes(tmp_path))
 
@@ -99,7 +100,7 @@ def test_a_scene_without_further_photographs_is_named(scene):
 @pytest.mark.parametrize("position", ["half", "", "nan", "2.5"])
 def test_a_position_that_no_view_can_have_is_named(scene, position):
     write_image(scene / f"view_{position}.png", picture(3))
-    with pytest.raises(FormatError, match=rf"a position of -1 to 2 .*, found '{position}'"):
+    with pytest.raises(FormatError, match=rf"a position from -1 to 2 .*, found '{position}'"):
         next(read_view_scenes(scene.parent))
 
 

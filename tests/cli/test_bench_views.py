@@ -64,14 +64,14 @@ def test_models_can_be_chosen(sets, tmp_path):
 @pytest.mark.parametrize(
     ("pictures", "fragment"),
     [
-        ((), "expected <scene>/left.png below it, or rendered sets, found neither"),
+        ((), "expected subfolders with left.png, or rendered sets, found neither"),
         (
             ("left", "right"),
-            "expected an image from between the cameras, such as view_0.5.png, found no view_*.png",
+            "expected a reference picture, such as view_0.5.png, found no view_*.png",
         ),
         (
             ("left", "right", "view_half"),
-            "a position of -1 to 2 (0 is the left camera, 1 the right one), found 'half'",
+            "a position from -1 to 2 (0 is the left camera and 1 the right one), found 'half'",
         ),
     ],
 )

@@ -176,7 +176,7 @@ def test_the_average_of_two_runs_lies_halfway_and_names_both_and_their_start_onc
 
 def test_runs_that_did_not_start_alike_cannot_be_averaged(trained):
     first = gone_on(trained, 1.0)
-    with pytest.raises(FormatError, match="found one with a different origin"):
+    with pytest.raises(FormatError, match="found a run with a different origin"):
         checkpoint.average(first, trained, trained)
 
 

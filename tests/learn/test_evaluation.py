@@ -162,7 +162,7 @@ def test_runs_with_different_held_out_pairs_are_refused(folder):
     checkpoint.save(kept_of(replace(PAPER, validation_pairs=3)), folder / "more" / "last.pt")
     message = complaint(evaluate, [folder / "random", folder / "more"], folder / "pairs", QUIET)
     assert message.startswith("more: expected the held-out pairs of random, (")
-    assert message.endswith("; score it separately")
+    assert message.endswith("; score this run separately")
 
 
 @pytest.mark.parametrize("other", ["elsewhere/random", "median"])

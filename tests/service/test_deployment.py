@@ -320,8 +320,8 @@ def test_a_port_in_use_is_reported_in_one_line(capsys):
         assert main(["serve", "--port", str(port)]) == 2
     printed = capsys.readouterr().err
     assert printed == (
-        f"stereoweave: --host 127.0.0.1 --port {port}: expected a free address, found "
-        "address already in use; --port 0 takes any free port\n"
+        f"stereoweave: --host 127.0.0.1 --port {port}: expected a free address, found none "
+        "(address already in use); --port 0 takes any free port\n"
     )
 
 

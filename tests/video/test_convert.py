@@ -318,7 +318,7 @@ def test_the_old_name_of_format_is_accepted_with_a_warning(capsys, command):
     assert "diagonal" in told
     assert main([*command.split(), "none.mp4", "--arrangement", "crossed", "--format", "crossed"]) == 2
     assert capsys.readouterr().err == (
-        "stereoweave: --arrangement: expected only --format, its new name, found both\n"
+        "stereoweave: --arrangement: expected only --format, which replaces --arrangement, found both\n"
     )
     assert main([command.split()[0], "--help"]) == 0
     assert "--arrangement" not in capsys.readouterr().out

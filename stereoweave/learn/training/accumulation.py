@@ -14,8 +14,9 @@ class StepSums:
     """Losses, gradients and batch-norm statistics, summed over the micro-batches of one step.
 
     PyTorch's DistributedDataParallel adds gradients in float32. Such sums depend on the order of addition,
-    hence on the number of processes: losses differ by 1 % after 50 steps of a small network. Here, gradients
-    are added in float64. Rounding back to float32 hides the order, except in one value in millions.
+    and therefore on the number of processes: losses differ by 1 % after 50 steps of a small network. Here,
+    gradients are added in float64. After rounding back to float32, the order affects only one value in
+    millions.
     """
 
     def __init__(self, network: nn.Module) -> None:
@@ -27,12 +28,12 @@ class StepSums:
         self.count, self.total = 0, torch.zeros(())
 
     def add(self, losses: Sequence[Float[Tensor, ""]]) -> None:
-        """Add a micro-batch after its backward pass, and reset the statistics to those before the step."""
+        """Add a micro-batch after its backward pass, and restore the statistics from before the step."""
         values = [*losses, *self._gradients(), *self.statistics]
         # Apple's GPUs have no float64, but they never train in several ranks either.
         exact = torch.float32 if losses[0].device.type == "mps" else torch.float64
         row = torch.cat([value.detach().flatten().to(exact) for value in values])
-        # In place, as below: for a large network the sums take as much memory as the optimiser.
+        # In place, as below, because a large network's sums take as much memory as the optimiser.
         self.total = self.total.add_(row) if self.count else row
         self.count += 1
         for value, before in zip(self.statistics, self.before, strict=True):

@@ -10,7 +10,7 @@ RESERVE_S = 20.0
 
 @dataclass(frozen=True, kw_only=True)
 class RunClock:
-    """Elapsed and remaining time of a run. Arguments `now_s` are values of `time.monotonic`.
+    """Elapsed and remaining time of a run. Each `now_s` is a value of `time.monotonic`.
 
     Attributes:
         began_s: Start of this command.
@@ -25,26 +25,26 @@ class RunClock:
     total_minutes: float
 
     def elapsed_s(self, now_s: float) -> float:
-        """Return the seconds of the run used so far."""
+        """Return the time of the run used so far, in seconds."""
         return self.used_s + now_s - self.began_s
 
     def elapsed_share(self, now_s: float) -> float:
-        """Return the share of the run's time used so far, 0 to 1; at 1, the last command stops training."""
+        """Return the share of the run's time used so far, 0 to 1. At 1, the last command stops training."""
         return min(self.elapsed_s(now_s) / (60 * self.total_minutes - RESERVE_S), 1.0)
 
     def remaining_s(self, now_s: float) -> float:
-        """Return the seconds left to train in this command; negative when overdue."""
+        """Return the time left to train in this command, in seconds; negative when overdue."""
         of_run = 60 * self.total_minutes - self.elapsed_s(now_s)
         of_command = 60 * self.minutes - (now_s - self.began_s)
         return min(of_run, of_command) - RESERVE_S
 
 
 def learning_rate_at(recipe: Recipe, optimiser_steps: int, share: float) -> float:
-    """Return the learning rate: linear warm-up over steps, a constant phase, then linear decay to 0.
+    """Return the learning rate, with a linear warm-up over steps, a constant phase and a linear decay to 0.
 
     Args:
-        recipe: Its decay takes the share `cool_down_steps / steps` of the time.
-        optimiser_steps: Steps since the optimiser started without a state.
+        recipe: Recipe of the run. The decay takes the share `cool_down_steps / steps` of the time.
+        optimiser_steps: Steps since the optimiser last started without a state.
         share: Share of the run's time used so far.
     """
     warm_up = (optimiser_steps + 1) / max(recipe.warm_up_steps, 1)

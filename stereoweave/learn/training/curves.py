@@ -1,4 +1,4 @@
-"""Learning curves: a run's validation scores against pairs seen, and power laws fitted to them."""
+"""Learning curves: validation scores against the number of pairs seen, with fitted power laws."""
 
 import csv
 import platform
@@ -36,11 +36,11 @@ def fit_power_law(pairs: Sequence[float], scores: Sequence[float]) -> PowerLaw:
 def record_curve(run: Path, out: Path) -> dict[str, PowerLaw]:
     """Write a run's scores to a CSV file. Returns a power law for each bad-1 and end-point error.
 
-    Rows of other recipes in the file are kept and come first.
+    Rows of other runs in the file are kept and come first.
 
     Args:
         run: Folder of the run.
-        out: CSV file of recipe, step, pairs seen, scores, commit and machine.
+        out: CSV file to write, with recipe, step, pairs seen, scores, commit and machine.
 
     Raises:
         StereoweaveError: If the run has no scores yet.
@@ -48,7 +48,7 @@ def record_curve(run: Path, out: Path) -> dict[str, PowerLaw]:
     kept, record = checkpoint.load(run / "last.pt"), read_scores(run / SCORES_FILE)
     if not record:
         raise StereoweaveError(
-            f"{run / SCORES_FILE}: expected scores of a run, found none; train until its first validation"
+            f"{run / SCORES_FILE}: expected scores of a run, found none; train until the first validation"
         )
     recipe = kept.recipe
     machine = f"{platform.machine()} {torch.backends.cpu.get_cpu_capability()}"

@@ -21,20 +21,20 @@ from torch.distributed.rendezvous import rendezvous
 from stereoweave.errors import StereoweaveError
 from stereoweave.learn.distributed import ProcessRank, choose_thread_count, read_rank
 
-# The other ranks wait while rank 0 makes pairs or validates. If rank 0 dies, torchrun ends them.
+# The other ranks wait while rank 0 makes pairs or validates. If rank 0 dies, torchrun stops them.
 _TIMEOUT = timedelta(days=1)
 
 
 def make_fabric(logger: TensorBoardLogger) -> Fabric:
-    """Set up this rank's device, and its process group under torchrun."""
+    """Set up this rank's device and, under torchrun, its process group."""
     own = read_rank()
     if own.world_size == 1:
         return Fabric(accelerator="auto", devices=1, precision=_choose_precision(), loggers=logger)
     cuda = torch.cuda.is_available()
     if cuda and own.local_world_size > torch.cuda.device_count():
         raise StereoweaveError(
-            f"torchrun: expected at most one process for each of the {torch.cuda.device_count()} GPUs, found "
-            f"{own.local_world_size}; start fewer with --nproc-per-node"
+            f"torchrun: expected at most one process per GPU, found {own.local_world_size} processes for "
+            f"{torch.cuda.device_count()} GPUs; start fewer with --nproc-per-node"
         )
     if (threads := choose_thread_count()) and not cuda:
         torch.set_num_threads(threads)
@@ -68,7 +68,7 @@ def skip_teardown_on_error() -> Iterator[None]:
 
 
 def keep_freed_memory() -> None:
-    """Make glibc keep large freed blocks, because fetching new ones from the kernel slows down every step."""
+    """Make glibc keep large freed blocks, because requesting memory from the kernel slows down every step."""
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
     if mallopt is not None:
         m_trim_threshold, m_top_pad, m_mmap_max = -1, -2, -4
@@ -81,7 +81,7 @@ def _join_ranks(own: ProcessRank, backend: str) -> None:
     """Join the ranks that torchrun started together on this machine.
 
     torchrun reuses one store for all restarts. Without a prefix per restart, new ranks find the addresses of
-    killed ones and wait for them (PyTorch's issue 135712).
+    killed ranks and wait for them (PyTorch issue 135712).
     """
     store, rank, count = next(rendezvous("env://", own.rank, own.world_size))
     prefix = f"start {os.environ['TORCHELASTIC_RESTART_COUNT']}"

@@ -1,4 +1,4 @@
-"""The training loop from a recipe to a network; an interrupted run resumes where it stopped."""
+"""Training loop: trains the network of a recipe, and resumes interrupted runs."""
 
 import csv
 import platform
@@ -32,22 +32,22 @@ SCORES_FILE = "validation.csv"
 
 
 def train(recipe_path: Path, out: Path, console: Console | None = None) -> Path:
-    """Train the network of a recipe in folder `out`, or resume its run. Returns the last checkpoint's path.
+    """Train a recipe's network in the folder `out`, or resume its run. Returns the last checkpoint's path.
 
-    Under torchrun the ranks share each step's micro-batches; only rank 0 writes.
+    Under torchrun, the ranks share each step's micro-batches, and only rank 0 writes files.
 
     Raises:
-        StereoweaveError: If the recipe is invalid, `out` is in use or holds the run of another recipe, or the
-            loss is not finite.
+        StereoweaveError: If the recipe is invalid, if `out` is in use or holds the run of another recipe, or
+            if the loss is not finite.
     """
     with report_once(), skip_teardown_on_error():
         return train_recipe(read_recipe(recipe_path), out, console or Console(quiet=read_rank().rank > 0))
 
 
 def train_recipe(recipe: Recipe, out: Path, console: Console) -> Path:
-    """Train a `Recipe`; see `train`."""
+    """Train the network of a `Recipe`; see `train`."""
     _check_recipe(recipe)
-    if read_rank().rank:  # only rank 0 writes and holds the lock
+    if read_rank().rank:  # only rank 0 writes files and holds the lock
         return _train(recipe, out, console)
     with lock_output(make_folder(out)):
         return _train(recipe, out, console)
@@ -85,7 +85,7 @@ def _train(recipe: Recipe, out: Path, console: Console) -> Path:
 def _prepare_pairs(
     recipe: Recipe, out: Path, console: Console, fabric: Fabric
 ) -> tuple[PairSource, PairSource]:
-    """Open the training pairs and the held-out pairs. Rank 0 makes missing ones."""
+    """Open the training pairs and the held-out pairs. Rank 0 makes the missing pairs."""
     found = open_sources(recipe, out.parent / "pairs")
     if fabric.is_global_zero:
         for pairs in found:
@@ -98,8 +98,8 @@ def _prepare_pairs(
 
 def _folder_not_shared(out: Path) -> StereoweaveError:
     return StereoweaveError(
-        f"{out}: expected the run that rank 0 sees in this folder, found another on {platform.node()}; "
-        "train into a folder that all machines share"
+        f"{out}: expected the run that rank 0 sees in this folder, found other contents on "
+        f"{platform.node()}; train into a folder that all machines share"
     )
 
 
@@ -117,7 +117,7 @@ def _validate(run: TrainingRun, steps: int, held_out: PairSource, last: Path, co
 
 
 def append_scores(path: Path, step: int, scores: dict[str, float]) -> None:
-    """Append the scores after `step` steps to a CSV file, replacing rows of that step and later ones."""
+    """Append the scores after `step` steps to a CSV file, replacing the rows of that and later steps."""
     rows = [row for row in read_scores(path) if row["step"] < step] + [{"step": step, **scores}]
     with replacing(path) as temporary, temporary.open("w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[-1]))
@@ -143,7 +143,7 @@ def close_curves(logger: TensorBoardLogger) -> Iterator[TensorBoardLogger]:
 
 
 def _check_recipe(recipe: Recipe) -> None:
-    """Raise FormatError for an unknown network or loss, or for sizes or rank counts that do not fit."""
+    """Raise FormatError if a network or loss is unknown, or if a size or the number of ranks is invalid."""
     with torch.device("meta"):
         network = build_network(recipe)
         build_objective(recipe, network)
@@ -151,18 +151,21 @@ def _check_recipe(recipe: Recipe) -> None:
     sizes = recipe.crop_size + (recipe.pair_size if recipe.dataset == COLLAGE else ())
     if any(side % multiple for side in sizes):
         raise FormatError(
-            f"{recipe.name}: pair_size = {list(recipe.pair_size)}, crop_size = {list(recipe.crop_size)}, "
-            f"expected multiples of {multiple} for {recipe.model}"
+            f"{recipe.name}: pair_size and crop_size: expected multiples of {multiple} for {recipe.model}, "
+            f"found {list(recipe.pair_size)} and {list(recipe.crop_size)}"
         )
     if recipe.micro_batches % read_rank().world_size:
         raise FormatError(
-            f"{recipe.name}: {recipe.micro_batches} micro-batches per step, expected a multiple of the "
-            f"{read_rank().world_size} processes; set micro_batch, or --nproc-per-node"
+            f"{recipe.name}: micro-batches per step: expected a multiple of the {read_rank().world_size} "
+            f"processes, found {recipe.micro_batches}; set micro_batch or --nproc-per-node"
         )
 
 
 def _load_batches(batches: Batches, first: int) -> Iterator[tuple[int, dict[str, torch.Tensor]]]:
-    """Yield the number and the batch of each step from `first` on; another process crops and recolours."""
+    """Yield the number and the batch of each step from `first` on.
+
+    Another process crops and recolours the pairs.
+    """
     steps = range(first, batches.recipe.steps)
     loader = DataLoader(
         CaughtBatches(batches),
@@ -171,7 +174,7 @@ def _load_batches(batches: Batches, first: int) -> Iterator[tuple[int, dict[str,
         num_workers=1,
         prefetch_factor=4,
         multiprocessing_context="spawn",
-        # With its own generator, because a loader draws a seed at each start, hence again when a run resumes.
+        # With its own generator, because a loader draws a seed whenever it starts, also when a run resumes.
         generator=torch.Generator(),
     )
     for step, batch in zip(steps, loader, strict=True):

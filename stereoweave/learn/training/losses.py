@@ -1,8 +1,8 @@
-"""Loss functions, from maps [B, 1, H, W] to a scalar. NaN in the ground truth is ignored.
+"""Loss functions, which reduce maps [B, 1, H, W] to a scalar. NaN in the ground truth is ignored.
 
-`weave_losses` and its terms are for WeaveNet. `CODE_LOSSES` and `projection_loss` are those of "Fast Depth
-Estimation for View Synthesis", for networks that predict the code of a `DepthCurve`. The perceptual loss
-needs weights and is in perceptual.py.
+`weave_losses` and its terms are for WeaveNet. `CODE_LOSSES` and `projection_loss` are the losses of
+"Fast Depth Estimation for View Synthesis", for networks that predict the code of a `DepthCurve`. The
+perceptual loss needs weights and is in perceptual.py.
 """
 
 from collections.abc import Callable
@@ -36,7 +36,7 @@ def weave_losses(
         truth_px: Ground-truth disparity of the same views; NaN where unknown.
         occluded: Pixels without a match; excluded from the loss of the raw correlation.
         distribution: Weight of the cross-entropies.
-        compare: Loss between estimated and true disparities in px; default: `regression_loss`.
+        compare: Loss between estimated and true disparities in px. Default: `regression_loss`.
     """
     compare = compare or regression_loss
     columns = torch.arange(truth_px.shape[3], device=truth_px.device)
@@ -61,7 +61,7 @@ def weave_losses(
 def level_cross_entropy(
     scores: Float[Tensor, "b d h w"], truth: Float[Tensor, "b 1 h w"]
 ) -> Float[Tensor, ""]:
-    """Return the cross-entropy over levels, whose target is split linearly between the two nearest levels."""
+    """Return the cross-entropy over levels, with the target split linearly between its two nearest levels."""
     levels = scores.shape[1]
     known = (truth >= 0) & (truth <= levels - 1)
     truth = truth.where(known, 0)
@@ -76,8 +76,8 @@ def regression_loss(
 ) -> Float[Tensor, ""]:
     """Return the mean absolute error, quadratic below 0.5 px and optionally blended with a logarithm.
 
-    The share `robust` of each error e is replaced by 2.5 log(1 + e), whose gradient is largest for errors
-    that are close to counting as correct.
+    The share `robust` of each error e is replaced by 2.5 log(1 + e), whose gradient is largest for small
+    errors, which almost count as correct.
     """
     known = truth_px.isfinite()
     # Unknown truth is replaced first, because NaN times a mask is NaN, in the gradient too.
@@ -92,7 +92,7 @@ def confidence_loss(
     disparity_px: Float[Tensor, "b 1 h w"],
     truth_px: Float[Tensor, "b 1 h w"],
 ) -> Float[Tensor, ""]:
-    """Return the binary cross-entropy of the predicted probability that the disparity is within 1 px."""
+    """Return the binary cross-entropy of the probability that the disparity is within 1 px of the truth."""
     within = (disparity_px.detach() - truth_px).abs() <= 1
     loss = F.binary_cross_entropy_with_logits(logit, within.float(), reduction="none")
     return masked_mean(loss, truth_px.isfinite())
@@ -118,19 +118,19 @@ def l1_loss(code: Float[Tensor, "b 1 h w"], truth: Float[Tensor, "b 1 h w"]) -> 
 def smooth_l1_loss(
     code: Float[Tensor, "b 1 h w"], truth: Float[Tensor, "b 1 h w"], beta: float = 1 / 192
 ) -> Float[Tensor, ""]:
-    """Return the smooth L1 loss of the code: quadratic below beta, absolute error less beta / 2 above.
+    """Return the smooth L1 loss of the code: quadratic below beta, and absolute error minus beta / 2 above.
 
     PSMNet and others switch at 1 px. For a code with exponent 1, this is 1 / max_disparity_px. The default
-    of 1 / 192 is for PSMNet's range.
+    of 1 / 192 matches PSMNet's range.
     """
     return _mean_known_loss(partial(F.smooth_l1_loss, beta=beta), code, truth)
 
 
 def cross_entropy_loss(code: Float[Tensor, "b 1 h w"], truth: Float[Tensor, "b 1 h w"]) -> Float[Tensor, ""]:
-    """Return the mean binary cross-entropy of codes in 0..1, which is least, but not 0, at the true code.
+    """Return the mean binary cross-entropy of codes in 0..1, which is lowest, but not 0, at the true code.
 
     PyTorch clamps the loss to 100 and its gradient to 1e12, so both are finite where a code is exactly 0 or
-    1. A sigmoid with such an output has a slope of 0, so it learns nothing there.
+    1. A sigmoid with such an output has a slope of 0, so the network learns nothing there.
     """
     return _mean_known_loss(F.binary_cross_entropy, code, truth)
 
@@ -146,12 +146,14 @@ CODE_LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
 def projection_loss(
     left: Float[Tensor, "b c h w"], right: Float[Tensor, "b c h w"], disparity_px: Float[Tensor, "b 1 h w"]
 ) -> Float[Tensor, ""]:
-    """Return the mean squared difference of the left image and its reconstruction from the right image.
+    """Return the mean squared difference between the left image and its reconstruction from the right image.
 
     This is the second term of the paper's equation (5). The mean is over all pixels of the batch whose match
-    lies inside the right image; 0 if there are none.
-    The paper does not define the images' range and channels. Here, images are in 0..1, like the code, so that
-    the weights of both terms are comparable. Channels are averaged, so that grey and colour weigh the same.
+    lies inside the right image; the loss is 0 if there are none.
+
+    The paper specifies neither the range nor the channels of images. Here, images are in 0..1, like the code,
+    so that the weights of both terms are comparable. Channels are averaged, so that grey and colour images
+    weigh the same.
     """
     reconstructed, exists = reconstruct_left(right, disparity_px)
     return masked_mean(((reconstructed - left) ** 2).mean(1, keepdim=True), exists)

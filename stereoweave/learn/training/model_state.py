@@ -11,7 +11,8 @@ from stereoweave.learn.checkpoint import Checkpoint
 from stereoweave.learn.models import build_network
 from stereoweave.learn.training.objective import Objective, build_objective
 
-# A step whose loss or gradient is not finite is skipped; a second one within this many steps ends the run.
+# A step with a loss or gradient that is not finite is skipped. A second such step within this many steps ends
+# the run.
 STEPS_BETWEEN_SKIPS = 500
 _MAX_GRADIENT_NORM = 5.0
 
@@ -22,8 +23,8 @@ class ModelState:
     Args:
         start: Weights and recipe to start from.
         device: Device of the network and of its average.
-        update_average: Moves the average towards the current weights; called by `AveragedModel`.
-        optimiser_state: State of the optimiser; {} for a new one.
+        update_average: Function that moves the average towards the current weights, for `AveragedModel`.
+        optimiser_state: State of the optimiser; {} for a new optimiser.
     """
 
     def __init__(

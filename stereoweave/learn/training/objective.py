@@ -1,4 +1,4 @@
-"""Training objectives: WeaveNet's, and the paper's for all other networks."""
+"""Training objectives: one for WeaveNet, and the paper's for all other networks."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -45,7 +45,7 @@ class Objective(Protocol):
     """A training loss and the validation scores that go with it."""
 
     def predict(self, network: Any, batch: Batch) -> Any:
-        """Return the predictions that `losses` needs, in the precision of the training."""
+        """Return the predictions that `losses` needs, in training precision."""
         ...
 
     def losses(self, predicted: Any, batch: Batch) -> dict[str, Tensor]:
@@ -58,26 +58,26 @@ class Objective(Protocol):
 
 
 def build_objective(recipe: Recipe, network: nn.Module) -> Objective:
-    """Build a recipe's objective. Raises FormatError if its loss is unknown or does not fit the network."""
+    """Build a recipe's objective. Raises FormatError if the loss is unknown or does not fit the network."""
     if recipe.loss not in LOSSES:
-        raise FormatError(f"{recipe.name}: loss = {recipe.loss!r}, expected {', '.join(LOSSES)}")
+        raise FormatError(f"{recipe.name}: loss: expected one of {', '.join(LOSSES)}, found {recipe.loss!r}")
     if isinstance(network, WeaveNet) != (recipe.loss == WEAVE):
         fitting = WEAVE if isinstance(network, WeaveNet) else " or ".join(LOSSES[1:])
         raise FormatError(
-            f"{recipe.name}: loss = {recipe.loss!r}, expected {fitting} for model = {recipe.model!r}"
+            f"{recipe.name}: loss: expected {fitting} for model = {recipe.model!r}, found {recipe.loss!r}"
         )
     if not isinstance(network, CodeNetwork):
         return WeaveObjective(recipe)
     if recipe.loss == CROSS_ENTROPY and network.predicts != "code":
         raise FormatError(
-            f"{recipe.name}: loss = {recipe.loss!r}, expected a network that predicts codes, found "
-            f"model = {recipe.model!r}, whose disparities may leave their range; choose another loss"
+            f"{recipe.name}: loss = {recipe.loss!r}: expected a network that predicts codes, found "
+            f"model = {recipe.model!r}, whose disparities may be out of range; choose another loss"
         )
     return CodeObjective(recipe, network)
 
 
 class WeaveObjective:
-    """Objective for WeaveNet: disparity of both views, with supervision of every stage.
+    """Objective for WeaveNet: disparities of both views, with supervision of every stage.
 
     With an exponent above 1, the regression compares codes of a `DepthCurve` times max_disparity_px. With
     an exponent of 1, it compares disparities in pixels.
@@ -114,8 +114,8 @@ class WeaveObjective:
 class CodeObjective:
     """Objective of the paper's equation (5), between codes of a `DepthCurve`, for the left view.
 
-    Disparities in pixels are converted to the same code, so that every network trains on every target and
-    with every loss. With loss = "smooth_l1" (or "l1"), exponent = 1 and alpha_p = 0 this is PSMNet's (or
+    Disparities in pixels are converted to the same code, so that every network can train on every target
+    and with every loss. With loss = "smooth_l1" (or "l1"), exponent = 1 and alpha_p = 0, this is PSMNet's (or
     DispNet's) own loss up to the factor 1 / d_max, to which Adam is invariant.
     """
 
@@ -138,7 +138,7 @@ class CodeObjective:
         return output if self.predicts == "code" else self.curve.encode_estimate(self.quantity(output, batch))
 
     def quantity(self, output: Map, batch: Batch) -> Map:
-        """Convert a network's output to the quantity of the target: disparity in px, or depth in m."""
+        """Convert a network's output to the target quantity: disparity in px, or depth in m."""
         if self.predicts == "code":
             return self.curve.decode(output)
         return output if self.recipe.target == "disparity" else self._depth_m(output, batch)
@@ -156,10 +156,10 @@ class CodeObjective:
 
     @torch.no_grad()
     def scores(self, network: CodeNetwork, pairs: PairSource, device: torch.device) -> dict[str, float]:
-        """Return the mean loss, its terms and errors over held-out pairs.
+        """Return the means of the loss, its terms and the errors over held-out pairs.
 
-        `squared_error` is the error of the linear code, before the exponent. Unlike the loss, it can be
-        compared between exponents. `depth_error_m` is returned only if the target is depth.
+        `squared_error` is the squared error of the linear code, without the exponent. Unlike the loss, it can
+        be compared between exponents. `depth_error_m` is returned only if the target is depth.
         """
         network.eval()
         rows = []
@@ -179,8 +179,8 @@ class CodeObjective:
     def _depth_m(self, disparity_px: Map, batch: Batch) -> Map:
         """Return the depth of an estimated disparity, extended along the tangent beyond max_depth_m.
 
-        The extension is finite and has a gradient even for disparities of 0 or less, where an untrained
-        network may start.
+        The extension is finite and has a gradient even for disparities of 0 or less, which an untrained
+        network may predict.
         """
         focal_baseline, shifted_px = batch["focal_baseline_px_m"], disparity_px + batch["doffs_px"]
         least_px = focal_baseline / self.recipe.max_depth_m
@@ -209,8 +209,8 @@ def _choose_comparison(recipe: Recipe) -> Callable[[Map, Map], Tensor]:
     if recipe.loss == PERCEPTUAL:
         if not recipe.vgg16_weights:
             raise FormatError(
-                f"{recipe.name}: loss = {PERCEPTUAL!r}, expected vgg16_weights, the path of torchvision's "
-                "vgg16-397923af.pth, found none; it is never downloaded automatically"
+                f"{recipe.name}: vgg16_weights: expected the path of torchvision's vgg16-397923af.pth for "
+                f"loss = {PERCEPTUAL!r}, found none; the file is never downloaded automatically"
             )
         return PerceptualLoss(Path(recipe.vgg16_weights))
     if recipe.loss == SMOOTH_L1:
@@ -220,7 +220,7 @@ def _choose_comparison(recipe: Recipe) -> Callable[[Map, Map], Tensor]:
 
 
 def build_curve(recipe: Recipe) -> DepthCurve:
-    """Build the curve between a recipe's target and its code."""
+    """Build the curve that converts a recipe's target to a code."""
     if recipe.target == "depth":
         return DepthCurve(exponent=recipe.exponent, max_depth_m=recipe.max_depth_m)
     return DepthCurve(exponent=recipe.exponent, max_disparity_px=recipe.max_disparity_px)
@@ -234,7 +234,7 @@ def fit_recipe(recipe: Recipe, pairs: PairSource) -> Recipe:
 
 
 def count_truth(recipe: Recipe, pairs: PairSource) -> Float[np.ndarray, " n"]:
-    """Return a histogram of linear codes of the ground truth, in equal bins, over evenly spread pairs."""
+    """Return a histogram of linear codes of the ground truth, in equal bins, over evenly spaced pairs."""
     straight = build_curve(replace(recipe, exponent=1.0))
     counts = np.zeros(_FITTED_BINS)
     for index in range(0, pairs.count, max(1, pairs.count // _FITTED_PAIRS)):
@@ -247,16 +247,16 @@ def count_truth(recipe: Recipe, pairs: PairSource) -> Float[np.ndarray, " n"]:
 def compute_target(recipe: Recipe, batch: Batch) -> Map:
     """Return the left views' truth as the recipe's target: disparity in px or depth in m; NaN where unknown.
 
-    Disparity above max_disparity_px counts as unknown, as in PSMNet's code. Depth beyond max_depth_m does
-    not, and is later rejected as an error.
+    Disparity above max_disparity_px counts as unknown, as in PSMNet's code. Depth beyond max_depth_m is
+    returned, and is later rejected as an error.
     """
     disparity_px = batch["disparity_px"][: len(batch["left"])]
     if recipe.target == "disparity":
         return disparity_px.where(disparity_px <= recipe.max_disparity_px, torch.nan)
     if "focal_baseline_px_m" not in batch:
         raise StereoweaveError(
-            f"{recipe.name}: target = 'depth', expected pairs with a camera, found dataset = "
-            f"{recipe.dataset!r} without one; train on disparity"
+            f"{recipe.name}: target = 'depth': expected pairs with a camera, found dataset = "
+            f"{recipe.dataset!r} without cameras; train on disparity"
         )
     depth_m = batch["focal_baseline_px_m"] / (disparity_px + batch["doffs_px"])
     # A depth of exactly max_depth_m, stored as disparity, may come back larger by a rounding error.
@@ -265,7 +265,7 @@ def compute_target(recipe: Recipe, batch: Batch) -> Map:
 
 @contextmanager
 def name_in_errors(what: str) -> Iterator[None]:
-    """Prefix a StereoweaveError of the block with `what`, the pairs in question, unless it starts with it."""
+    """Prefix each StereoweaveError raised in the block with `what`, the name of the pairs, but only once."""
     try:
         yield
     except StereoweaveError as error:

@@ -14,10 +14,10 @@ WEIGHTS = "vgg16-397923af.pth, torchvision's VGG-16 trained on ImageNet"
 
 
 class PerceptualLoss(nn.Module):
-    """Feature reconstruction loss of Johnson et al. (2016) between codes, on VGG-16's relu2_2.
+    """Feature reconstruction loss of Johnson et al. (2016) between codes, computed on VGG-16's relu2_2.
 
     Johnson et al. use relu2_2 to reconstruct images; deeper layers localise edges less well. The weights are
-    frozen; the file needs only those of the first four convolutions.
+    frozen. The file needs to contain only the weights of the first four convolutions.
 
     Args:
         weights: File with VGG-16's weights under torchvision's names; never downloaded automatically.
@@ -28,7 +28,8 @@ class PerceptualLoss(nn.Module):
 
     def __init__(self, weights: Path) -> None:
         super().__init__()
-        # Without storage, so that no random weights are drawn: a seed trains the same with any loss.
+        # Without storage, so that no random numbers are drawn, and a seed gives the same training with any
+        # loss.
         with torch.device("meta"):
             self.features = nn.Sequential(
                 *_convolution(3, 64), *_convolution(64, 64), nn.MaxPool2d(2),
@@ -36,17 +37,17 @@ class PerceptualLoss(nn.Module):
             )  # fmt: skip
         self.load_state_dict(_read(weights, self.state_dict()), assign=True)
         self.requires_grad_(False)
-        # ImageNet's statistics, with which VGG-16 was trained; not in the state, which mirrors the file.
+        # VGG-16 was trained with ImageNet's statistics. They are not in the state, because the file has none.
         mean, deviation = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
         self.register_buffer("mean", mean.view(3, 1, 1), persistent=False)
         self.register_buffer("deviation", deviation.view(3, 1, 1), persistent=False)
 
     def forward(self, code: Float[Tensor, "b 1 h w"], truth: Float[Tensor, "b 1 h w"]) -> Float[Tensor, ""]:
-        """Return the mean squared difference of the features; 0 if no pixel is known.
+        """Return the mean squared difference of the features; 0 if no pixels are known.
 
-        A feature covers 14x14 pixels, so unknown pixels cannot be masked afterwards. They are set to the
-        prediction in both maps, so that they are equal and have no gradient. The mean is divided by the
-        share of known pixels, so that sparse ground truth weighs as much as in the other losses.
+        A feature covers 14x14 pixels, so unknown pixels cannot be masked afterwards. In both maps, they are
+        set to the prediction, so that the maps are equal there and have no gradient. The mean is divided by
+        the share of known pixels, so that sparse ground truth weighs as much as in the other losses.
 
         Args:
             code: Predicted code in 0..1.
@@ -68,13 +69,17 @@ def _convolution(inputs: int, outputs: int) -> tuple[nn.Module, nn.Module]:
 
 
 def _read(path: Path, expected: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Read the tensors named in `expected`, in float32. Raises FormatError if any does not match."""
+    """Read the tensors named in `expected` as float32.
+
+    Raises:
+        FormatError: If a tensor is missing or has the wrong shape.
+    """
     found = _load(path)
     for name, tensor in expected.items():
-        shape = list(getattr(found.get(name), "shape", [])) or "nothing"
+        shape = list(getattr(found.get(name), "shape", [])) or "none"
         if shape != list(tensor.shape):
             raise FormatError(
-                f"{path}: {name}: expected {list(tensor.shape)}, found {shape}; is it {WEIGHTS}?"
+                f"{path}: {name}: expected shape {list(tensor.shape)}, found {shape}; is the file {WEIGHTS}?"
             )
     return {name: found[name].float() for name in expected}
 

@@ -1,4 +1,4 @@
-"""The state of a run of `train`: where it starts or resumes, its steps, and its checkpoints."""
+"""The state of a run of `train`: its starting point, its steps and its checkpoints."""
 
 import logging
 import time
@@ -48,7 +48,7 @@ class TrainingRun(ModelState):
     def step(self, step: int, batch: dict[str, torch.Tensor], batches: Batches) -> float:
         """Take one optimiser step. Returns the loss.
 
-        A step whose loss or gradient is not finite changes nothing; it is counted and logged.
+        A step whose loss or gradient is not finite changes no weights; it is counted and logged.
 
         Raises:
             StereoweaveError: If two such steps are less than 500 steps apart.
@@ -94,7 +94,7 @@ class TrainingRun(ModelState):
         return dict(zip(["loss", *terms], means, strict=True))
 
     def _skip(self, step: int, found: str, batches: Batches) -> None:
-        found = f"step {step}: {found}; its pairs are {', '.join(batches.names(step))}"
+        found = f"step {step}: {found}; the pairs are {', '.join(batches.names(step))}"
         if self.skipped and step - self.skipped[-1] < STEPS_BETWEEN_SKIPS:
             raise StereoweaveError(f"{found}; step {self.skipped[-1]} was skipped for the same reason")
         self.skipped.append(step)
@@ -102,12 +102,12 @@ class TrainingRun(ModelState):
         _LOGGER.warning("%s; skipped", found)
 
     def save_periodically(self, step: int, path: Path) -> None:
-        """Save a checkpoint after `step` steps if the last one is over ten minutes old."""
+        """Save a checkpoint after `step` steps if the last checkpoint is over ten minutes old."""
         if self.fabric.is_global_zero and time.monotonic() - self.saved_s > _SAVE_EVERY_S:
             self._write(step, self.scores, path)
 
     def save(self, step: int, scores: dict[str, float], path: Path) -> None:
-        """Save a checkpoint after `step` steps and log its scores."""
+        """Save a checkpoint after `step` steps, and log the scores."""
         self.fabric.log_dict({f"validation/{name}": score for name, score in scores.items()}, step)
         self._write(step, scores, path)
 
@@ -127,13 +127,13 @@ class TrainingRun(ModelState):
 
 
 def load_start(recipe: Recipe, last: Path) -> Checkpoint:
-    """Load the state to start from: the run's last checkpoint, else `start_from` or random weights."""
+    """Return the state to start from: the run's last checkpoint, else `start_from` or random weights."""
     if last.exists():
         found = checkpoint.load(last)
         if replace(found.recipe, **{name: getattr(recipe, name) for name in _RESUMABLE}) != recipe:
             raise StereoweaveError(
-                f"{last}: expected a run of this recipe, found one of another ({found.recipe.name}); "
-                "train into a new folder, or remove the file"
+                f"{last}: expected a run of this recipe, found a run of recipe {found.recipe.name} with "
+                "other settings; train into a new folder, or remove the file"
             )
         return replace(found, recipe=recipe, commit=checkpoint.find_commit())
     return checkpoint.make_initial(recipe, checkpoint.find_commit())
@@ -146,7 +146,7 @@ def _update_average(
     current: Sequence[torch.Tensor],
     steps: torch.Tensor | int,
 ) -> None:
-    """Move the average towards the current weights, fast at first to forget the initial weights soon."""
+    """Move the average towards the current weights, faster at first to forget the initial weights soon."""
     share = max(1 / averaged_steps, 9 / (9 + float(steps)))
     for average, value in zip(averaged, current, strict=True):
         if average.is_floating_point():

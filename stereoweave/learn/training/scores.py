@@ -17,7 +17,7 @@ Map = Float[np.ndarray, "h w"]
 
 @torch.no_grad()
 def validate(network: nn.Module, pairs: PairSource, device: torch.device) -> dict[str, float]:
-    """Return mean scores over the left views of the pairs, occluded pixels included."""
+    """Return mean scores over the left views of the pairs, including occluded pixels."""
     rows, confidences, truths = [], [], []
     for sample, estimate_px, confidence in _predict(network, pairs, device):
         rows.append(_compute_errors(estimate_px, sample.disparity_px))

@@ -1,7 +1,7 @@
 """Training for a fixed time, on a machine that is available only for short commands.
 
-`train` counts steps; here, a command ends on time. The learning rate reaches 0 when the minutes of all
-commands are used up. Each command resumes from the files of the previous one.
+Unlike `train`, which counts steps, each command here ends on time. The learning rate reaches 0 when the
+minutes of all commands are used up. Each command resumes from the files of the previous command.
 """
 
 import math
@@ -40,14 +40,15 @@ class TimedCommand:
 
     Attributes:
         out: Folder to write to, and to resume from if it holds a run.
-        earlier: Folder with an earlier command's files; of it and `out`, the run further ahead is resumed.
-        began_s: Start of the command, by `time.monotonic`.
+        earlier: Folder with the files of an earlier command. The run that is further ahead, in this folder or
+            in `out`, is resumed.
+        began_s: Start of the command, as a value of `time.monotonic`.
         minutes: Time limit of this command.
         total_minutes: Time limit of all commands together.
         device: "cuda" or "cpu".
-        processes: Number of processes that paint and crop batches.
-        cool_down_crop: Height and width of crops during the cool-down; None: the recipe's.
-        commit: Commit of the code, for a machine without git; "" asks git.
+        processes: Number of processes that make batches.
+        cool_down_crop: Height and width of the crops during the cool-down. Default: as in the recipe.
+        commit: Commit of the code, for a machine without git. Default: found with git.
     """
 
     out: Path
@@ -63,7 +64,7 @@ class TimedCommand:
 
 @dataclass(frozen=True)
 class _Snapshot:
-    """Time and counters at one moment of the training."""
+    """Time and counters at one moment during training."""
 
     at_s: float
     pairs: int = 0
@@ -72,7 +73,7 @@ class _Snapshot:
 
 
 def train_by_clock(recipe: Recipe, command: TimedCommand, report: Report) -> RunProgress:
-    """Train for the minutes of one command. Returns the run's progress.
+    """Train for the duration of one command. Returns the run's progress.
 
     Raises:
         StereoweaveError: If the files to resume from are invalid, no batches can be made, or losses are not
@@ -89,7 +90,7 @@ def train_by_clock(recipe: Recipe, command: TimedCommand, report: Report) -> Run
         total_minutes=command.total_minutes,
     )
     if clock.remaining_s(time.monotonic()) <= 0:
-        report(f"the {command.total_minutes:g} minutes are used up; {command.out} is not changed")
+        report(f"all {command.total_minutes:g} minutes are used up; {command.out} is unchanged")
         return start.progress
     recipes = [
         recipe,
@@ -116,7 +117,7 @@ class _TimedLoop:
         self.progress, self.losses = RunProgress(), list[float]()
 
     def train_from(self, progress: RunProgress) -> None:
-        """Train until the command's time is over, with periodic reports and checkpoints."""
+        """Train until the command's time is up, with periodic reports and checkpoints."""
         self.progress = progress
         batch = self._smoke_test()
         self.reported = self._take_snapshot()
@@ -135,7 +136,7 @@ class _TimedLoop:
                 self._save({})
 
     def finish(self, held_out: PairSource) -> None:
-        """Save the run with its scores, and report them."""
+        """Score and save the run, and report the scores."""
         too_late = self.clock.remaining_s(time.monotonic()) < -RESERVE_S
         if too_late or (isinstance(held_out, CachedPairs) and held_out.missing()):
             self.report("not scored: out of time" if too_late else "not scored: no held-out pairs")
@@ -153,9 +154,9 @@ class _TimedLoop:
         return None
 
     def _smoke_test(self) -> dict[str, torch.Tensor]:
-        """Run every part once on the first batch, so that faults show at once. Returns the batch.
+        """Run every part of the training once, on the first batch, to reveal faults. Returns the batch.
 
-        Disables bfloat16 if its loss differs too much from the loss in float32.
+        bfloat16 is disabled if its loss differs too much from the loss in float32.
         """
         batch = self.run.move_to_device(self.painters.take())
         plain = self.run.loss(batch, bfloat16=False)
@@ -170,7 +171,7 @@ class _TimedLoop:
         checkpoint.load(self.out / NETWORK_FILE)
         self.report(
             f"{self._format_elapsed()}  smoke test passed: files can be written and read, and the network "
-            f"alone takes {pairs_per_s:.1f} pairs/s"
+            f"alone processes {pairs_per_s:.1f} pairs/s"
         )
         return batch
 

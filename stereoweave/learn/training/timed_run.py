@@ -17,8 +17,8 @@ from stereoweave.learn.checkpoint import Checkpoint, Weights
 from stereoweave.learn.recipe import Recipe
 from stereoweave.learn.training.model_state import ModelState
 
-# A checkpoint that `stereoweave train` and `export` accept, the optimiser's state, which it lacks, and the
-# progress.
+# A checkpoint that `stereoweave train` and `export` accept, the optimiser's state, which the checkpoint does
+# not contain, and the progress.
 NETWORK_FILE, OPTIMISER_FILE, PROGRESS_FILE = "network.pt", "optimiser.pt", "progress.json"
 
 
@@ -28,9 +28,9 @@ class RunProgress:
 
     Attributes:
         seconds: Time used by all commands.
-        steps: Optimiser steps, including skipped ones.
-        optimiser_steps: Steps since the optimiser started without a state.
-        pairs: Pairs trained on.
+        steps: Optimiser steps, including skipped steps.
+        optimiser_steps: Steps since the optimiser last started without a state.
+        pairs: Number of pairs trained on.
         batches: Number of the next batch to request.
         skipped: Steps skipped because the loss or the gradient was not finite.
         last_skipped: The last skipped step, counted from 0.
@@ -55,7 +55,7 @@ class ResumePoint:
 
 
 def find_resume_point(recipe: Recipe, out: Path, earlier: Path | None, commit: str) -> ResumePoint:
-    """Return the state of the run in `out` or `earlier`, whichever is further ahead, else of a new run.
+    """Return the state of the run in `out` or `earlier`, whichever is further ahead, or of a new run.
 
     Raises:
         FormatError: If a file is broken or missing, or `start_from` shares no weights with the network.
@@ -63,7 +63,8 @@ def find_resume_point(recipe: Recipe, out: Path, earlier: Path | None, commit: s
     """
     if earlier and not (earlier / PROGRESS_FILE).exists():
         raise FormatError(
-            f"{earlier}: expected {PROGRESS_FILE} of an earlier command, found none; copy all of its files"
+            f"{earlier}: expected {PROGRESS_FILE} from an earlier command, found none; copy all of that "
+            "command's files"
         )
     folders = [folder for folder in (out, earlier) if folder and (folder / PROGRESS_FILE).exists()]
     found = [(_read_progress(folder / PROGRESS_FILE), folder) for folder in folders]
@@ -75,7 +76,7 @@ def find_resume_point(recipe: Recipe, out: Path, earlier: Path | None, commit: s
     last = checkpoint.load(folder / NETWORK_FILE)
     if last.recipe.model != recipe.model:
         raise StereoweaveError(
-            f"{folder / NETWORK_FILE}: expected a run of {recipe.model}, found one of {last.recipe.model}; "
+            f"{folder / NETWORK_FILE}: expected a run of {recipe.model}, found a run of {last.recipe.model}; "
             "use another folder"
         )
     optimiser = _read_optimiser(folder / OPTIMISER_FILE)
@@ -90,7 +91,7 @@ def _read_progress(path: Path) -> RunProgress:
         return RunProgress(**json.loads(path.read_text(encoding="utf-8")))
     except (ValueError, TypeError) as error:
         raise FormatError(
-            f"{path}: expected the progress of a timed run, found other content ({error})"
+            f"{path}: expected the progress of a timed run, found unexpected contents ({error})"
         ) from error
 
 
@@ -107,17 +108,18 @@ class TimedRun(ModelState):
         super().__init__(start, device, update_average, optimiser)
         self.device = device
         self.bfloat16 = device.type == "cuda" and torch.cuda.is_bf16_supported()
-        # At 0, the first update would copy the weights. On the CPU, reading it does not wait for the GPU.
+        # With a count of 0, the first update would copy the weights. The count stays on the CPU, because
+        # reading it from the GPU would wait.
         self.averaged.n_averaged = torch.ones((), dtype=torch.long)
 
     def move_to_device(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Move a batch of `Painters` to the device, with images in 0..1."""
+        """Move a batch from `Painters` to the device, and scale its images to 0..1."""
         there = {name: value.to(self.device, non_blocking=True) for name, value in batch.items()}
         return there | {side: there[side].float() / 255 for side in ("left", "right")}
 
     @torch.no_grad()
     def loss(self, batch: dict[str, Tensor], bfloat16: bool) -> float:
-        """Return the loss of a batch in the given precision, without learning."""
+        """Return the loss of a batch in the given precision, without training on it."""
         self.network.train()
         value = float(self._loss(batch, bfloat16))
         self._restore_statistics()
@@ -132,7 +134,7 @@ class TimedRun(ModelState):
         return loss.detach()
 
     def finish(self, loss: Tensor, learning_rate: float) -> float:
-        """Take the step if its loss and gradient are finite. Returns the loss, or NaN if they are not."""
+        """Take the step if the loss and gradient are finite. Returns the loss; NaN for a skipped step."""
         norm = self.clip_gradient()
         value, length = torch.stack([loss.float(), norm.float()]).tolist()
         if not (math.isfinite(value) and math.isfinite(length)):
@@ -150,7 +152,7 @@ class TimedRun(ModelState):
         return self.objective.scores(self.averaged.module, held_out, self.device)
 
     def save(self, folder: Path, progress: RunProgress, hours: float, scores: dict[str, float]) -> None:
-        """Write network, optimiser and progress, each atomically.
+        """Write the network, the optimiser and the progress, each atomically.
 
         Raises:
             StereoweaveError: If a weight is not finite; the previous files are kept.
@@ -158,8 +160,8 @@ class TimedRun(ModelState):
         weights, averaged = _copy_to_cpu(self.network), _copy_to_cpu(self.averaged.module)
         if not all(bool(value.isfinite().all()) for value in (*weights.values(), *averaged.values())):
             raise StereoweaveError(
-                f"step {progress.steps}: expected finite weights, found NaN or infinity; {folder} keeps "
-                "the last checkpoint; lower the learning rate and resume"
+                f"step {progress.steps}: expected finite weights, found NaN or infinity; lower the learning "
+                f"rate, and resume from the last checkpoint in {folder}"
             )
         state = replace(
             self.start, step=progress.steps, weights=weights, averaged=averaged, hours=hours, scores=scores
@@ -177,7 +179,7 @@ class TimedRun(ModelState):
 
     @torch.no_grad()
     def _restore_statistics(self) -> None:
-        """Set the batch norms' statistics to those of the averaged network, which are always finite."""
+        """Copy the batch-norm statistics of the averaged network, which are always finite."""
         for value, kept in zip(self.network.buffers(), self.averaged.module.buffers(), strict=True):
             value.copy_(kept)
 

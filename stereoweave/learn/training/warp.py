@@ -8,21 +8,22 @@ from torch import Tensor
 def reconstruct_left(
     right: Float[Tensor, "b c h w"], disparity_px: Float[Tensor, "b 1 h w"]
 ) -> tuple[Float[Tensor, "b c h w"], Bool[Tensor, "b 1 h w"]]:
-    """Warp the right image to the left view. Returns the image and the mask of pixels with a match.
+    """Warp the right image to the left view. Returns the warped image and the mask of pixels with a match.
 
-    Pixel (i, j) is interpolated linearly at (i - d, j) of the right image. It has a match if
-    0 <= i - d <= W - 1; elsewhere its value is meaningless and has no gradient.
+    Pixel (i, j) of disparity d is interpolated linearly at (i - d, j) in the right image. It has a match if
+    0 <= i - d <= W - 1; otherwise its value is meaningless and has no gradient.
 
     Args:
-        right: Right image [B, C, H, W], at least 2 wide.
-        disparity_px: Disparity of the left view; non-finite values have no match.
+        right: Right image [B, C, H, W], at least 2 pixels wide.
+        disparity_px: Disparity of the left view; pixels with non-finite values have no match.
     """
     last = right.shape[3] - 1
     # In float32: bfloat16 has no odd integers above 256.
     columns = torch.arange(last + 1, device=right.device, dtype=torch.float32)
     position_px = columns - disparity_px
     exists = (position_px >= 0) & (position_px <= last)
-    # Outside positions are replaced first, so no index leaves the row, and no infinity meets a gradient of 0.
+    # Positions outside the image are replaced first, so that every index is in the row and no infinity is
+    # multiplied by a gradient of 0.
     position_px = position_px.where(exists, 0)
     start = position_px.detach().floor().clamp(max=last - 1)
     first, second = (right.gather(3, (start.long() + i).expand_as(right)) for i in (0, 1))
@@ -35,10 +36,10 @@ def depth_to_disparity(
     doffs_px: Float[Tensor, "b 1 1 1"],
     width_px: int,
 ) -> Float[Tensor, "b 1 h w"]:
-    """Return the disparity f B / z - doffs in px, with finite value and gradient for any depth, 0 included.
+    """Return the disparity f B / z - doffs in px. Value and gradient are finite for any depth, including 0.
 
-    Depth below f B / (width + |doffs|) has its match outside the right image. Its disparity is clamped to the
-    disparity of this limit, without a gradient.
+    Below a depth of f B / (width + |doffs|), the match lies outside the right image. The disparity is then
+    clamped to its value at this depth, and has no gradient.
 
     Args:
         depth_m: Depth of the left view.

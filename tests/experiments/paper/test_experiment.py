@@ -157,10 +157,13 @@ def test_the_exponent_is_fitted_to_the_training_truth(experiment):
     [
         (
             {"model": "weave_small"},
-            "model = 'weave_small', expected 'fast_depth', which the experiment starts from",
+            "model: expected 'fast_depth', from which the experiment starts, found 'weave_small'",
         ),
-        ({"target": "depth"}, "target = 'depth', expected 'disparity', which the experiment starts from"),
-        ({"steps": 3}, "steps = 3, expected at least 4, because some trainings take a quarter of them"),
+        (
+            {"target": "depth"},
+            "target: expected 'disparity', from which the experiment starts, found 'depth'",
+        ),
+        ({"steps": 3}, "steps: expected at least 4, because some trainings take a quarter of them, found 3"),
     ],
 )
 def test_a_plan_starts_from_the_papers_network_and_of_collages_from_disparity(tmp_path, changes, words):
@@ -409,8 +412,8 @@ def test_run_times_beside_the_report_join_it(experiment, tmp_path):
     speed.write_text("network\nfast_depth\n")
     words = complaint(write_report, BASE, experiment.of(EARLY), experiment.runs, tmp_path)
     assert words == (
-        f"{speed}: expected the rows of `python -m experiments.speed`, found 'onnx_relative'; "
-        "write it again or remove it"
+        f"{speed}: expected the rows of `python -m experiments.speed`, found rows that cannot be parsed "
+        "('onnx_relative'); write the file again or remove it"
     )
 
 

@@ -155,7 +155,7 @@ def test_a_folder_with_a_run_of_another_recipe_is_refused(folder, finished, tmp_
     before = finished.read_bytes()
     with pytest.raises(
         StereoweaveError,
-        match=r"last\.pt: expected a run of this recipe, found one of another \(tiny\); "
+        match=r"last\.pt: expected a run of this recipe, found a run of recipe tiny with other settings; "
         r"train into a new folder",
     ):
         train(other, finished.parent, QUIET)
@@ -216,7 +216,7 @@ def test_a_second_loss_that_is_not_finite_stops_the_run_and_names_the_pairs(fold
     with pytest.raises(StereoweaveError) as caught:
         train(file, folder / "broken", QUIET)
     assert str(caught.value) == (
-        f"step 1: the loss is nan; its pairs are {names}; step 0 was skipped for the same reason"
+        f"step 1: the loss is nan; the pairs are {names}; step 0 was skipped for the same reason"
     )
     assert not (folder / "broken" / "last.pt").exists()
 
@@ -255,8 +255,8 @@ def test_a_truth_out_of_range_is_named_with_the_pairs_of_its_step(tmp_path, logg
 def test_weights_of_another_network_are_refused_as_a_start(finished, tmp_path):
     recipe = recipe_of("fast_depth", start_from=str(finished))
     assert complaint(load_start, recipe, tmp_path / "last.pt") == (
-        f"tiny: start_from = {str(finished)!r}, expected a checkpoint that shares weights with fast_depth, "
-        "found one of weave_small"
+        "tiny: start_from: expected a checkpoint that shares weights with fast_depth, found "
+        f"{str(finished)!r}, a checkpoint of weave_small"
     )
 
 
@@ -270,7 +270,7 @@ def test_gradients_that_are_not_finite_never_reach_the_weights_and_the_second_st
     # A product with infinity makes the gradient infinite and leaves the loss as it was.
     network.head.to_code.bias.register_hook(lambda gradient: gradient * torch.inf)
     batches = Batches(recipe, CAMERA_PAIRS)
-    found = f"step 7: the norm of the gradient is inf; its pairs are {', '.join(batches.names(7))}"
+    found = f"step 7: the norm of the gradient is inf; the pairs are {', '.join(batches.names(7))}"
     run.step(7, batches[7], batches)
     assert run.skipped == [7]
     assert caplog.messages[-1] == f"{found}; skipped"
@@ -293,7 +293,9 @@ def test_a_recipe_for_an_unknown_network_is_refused(tmp_path):
 @pytest.mark.parametrize("sizes", [{"crop_size": (64, 56)}, {"pair_size": (64, 100)}])
 def test_a_recipe_with_sizes_that_the_network_cannot_divide_is_refused(tmp_path, sizes):
     file = write(replace(RECIPE, **sizes), tmp_path / "odd.toml")
-    with pytest.raises(FormatError, match=r"tiny: pair_size = .*, expected multiples of 16 for weave_small"):
+    with pytest.raises(
+        FormatError, match=r"tiny: pair_size and crop_size: expected multiples of 16 for weave_small"
+    ):
         train(file, tmp_path / "run", QUIET)
 
 

@@ -208,7 +208,7 @@ def test_a_disparity_below_0_is_refused():
 
 def test_depth_without_a_camera_is_refused():
     assert complaint(losses_of, DEPTH, Constant("code", 0.5), batch_of(TRUTH_PX)) == (
-        "tiny: target = 'depth', expected pairs with a camera, found dataset = 'collage' without one; "
+        "tiny: target = 'depth': expected pairs with a camera, found dataset = 'collage' without cameras; "
         "train on disparity"
     )
 
@@ -228,19 +228,19 @@ def test_a_loss_that_is_unknown_or_another_network_s_is_refused():
     with torch.device("meta"):
         weave = build_network(RECIPE)
     for recipe, network, expected in (
-        (replace(DISPARITY, loss="l3"), paper, ", ".join(LOSSES)),
+        (replace(DISPARITY, loss="l3"), paper, f"one of {', '.join(LOSSES)}"),
         (replace(DISPARITY, loss="weave"), paper, f"{known} for model = 'fast_depth'"),
         (replace(RECIPE, loss="l2"), weave, "weave for model = 'weave_small'"),
     ):
         message = complaint(build_objective, recipe, network)
-        assert message == f"tiny: loss = {recipe.loss!r}, expected {expected}"
+        assert message == f"tiny: loss: expected {expected}, found {recipe.loss!r}"
 
 
 def test_cross_entropy_is_refused_for_pixels_which_may_leave_their_range():
     recipe = replace(DISPARITY, loss="cross_entropy")
     assert complaint(build_objective, recipe, Constant("disparity_px", 2.0)) == (
-        "tiny: loss = 'cross_entropy', expected a network that predicts codes, found model = "
-        f"{recipe.model!r}, whose disparities may leave their range; choose another loss"
+        "tiny: loss = 'cross_entropy': expected a network that predicts codes, found model = "
+        f"{recipe.model!r}, whose disparities may be out of range; choose another loss"
     )
     assert build_objective(recipe, Constant("code", 0.5)).recipe == recipe
 
@@ -248,8 +248,8 @@ def test_cross_entropy_is_refused_for_pixels_which_may_leave_their_range():
 def test_a_perceptual_loss_without_the_name_of_its_file_is_refused():
     recipe = replace(DISPARITY, loss="perceptual")
     message = complaint(build_objective, recipe, Constant("code", 0.5))
-    assert message.startswith("tiny: loss = 'perceptual', expected vgg16_weights, the path of torchvision's")
-    assert message.endswith("found none; it is never downloaded automatically")
+    assert message.startswith("tiny: vgg16_weights: expected the path of torchvision's vgg16-397923af.pth")
+    assert message.endswith("found none; the file is never downloaded automatically")
 
 
 def test_a_perceptual_loss_without_its_file_is_refused(tmp_path):

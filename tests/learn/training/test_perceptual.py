@@ -154,12 +154,12 @@ def test_a_file_that_lacks_a_layer_is_refused_by_its_name(tmp_path):
     state = weights()
     del state["features.5.weight"]
     message = refused(saved(tmp_path, state))
-    assert "features.5.weight: expected [128, 64, 3, 3], found nothing" in message
+    assert "features.5.weight: expected shape [128, 64, 3, 3], found none" in message
 
 
 def test_a_layer_of_another_shape_is_refused_with_both_shapes(tmp_path):
     message = refused(saved(tmp_path, weights() | {"features.2.bias": torch.zeros(32)}))
-    assert "features.2.bias: expected [64], found [32]" in message
+    assert "features.2.bias: expected shape [64], found [32]" in message
 
 
 def test_a_file_that_is_no_state_of_a_network_is_refused(tmp_path):

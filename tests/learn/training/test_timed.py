@@ -182,10 +182,12 @@ def test_of_two_folders_the_run_that_is_further_ahead_is_resumed(tmp_path):
 
 
 def test_files_from_which_no_run_can_resume_are_named(tmp_path):
-    assert "copy all of its files" in complaint(find_resume_point, RECIPE, tmp_path / "out", tmp_path, "")
+    assert "copy all of that command's files" in complaint(
+        find_resume_point, RECIPE, tmp_path / "out", tmp_path, ""
+    )
     run_of().save(tmp_path, RunProgress(), 0.0, {})
     other = replace(RECIPE, model="weave_base")
-    assert "expected a run of weave_base, found one of weave_small" in complaint(
+    assert "expected a run of weave_base, found a run of weave_small" in complaint(
         find_resume_point, other, tmp_path, None, ""
     )
     (tmp_path / PROGRESS_FILE).write_text("{}x")
