@@ -56,14 +56,13 @@ ERRORS = {
     "metres: expected a focal length in EXIF in addition to the baseline, found none; give the focal length "
     "(focal_px)": lambda: prepare(PAIR, Request(baseline_m=0.1)),
     "rectify: expected at least 40 feature matches that agree on the camera positions, found 0 of 0 "
-    "matches; take pictures with more texture and more overlap; or give a calibration (calibration)": (
-        lambda: prepare(PLAIN, Request(rectify=True))
-    ),
+    "matches; photograph a scene with more texture and with more overlap; or give a calibration "
+    "(calibration)": (lambda: prepare(PLAIN, Request(rectify=True))),
     "expected a camera for depth, found none; give a calibration, or the focal length and baseline of a "
     "rectified pair (calibration, focal_px, baseline_m)": (
         lambda: require_camera(sw.StereoPair(left=BLACK, right=BLACK))
     ),
-    "raw: cannot be combined with refined, because it is the network's own disparity; leave one of them out "
+    "raw: cannot be combined with refined, because raw output is not post-processed; leave one of them out "
     "(raw, refined)": (lambda: MatchOptions(raw=True, refined=True)),
     "expected pictures or a folder, patterns of left and right pictures, or a list of pairs, found none; "
     "give exactly one of them (left, right, listed)": lambda: find_pairs([], None, None, None),
@@ -98,7 +97,7 @@ def test_an_error_names_settings_by_their_keyword(folder, text):
 def test_a_note_names_settings_by_their_keyword(folder):
     lower = check_pair(read_image("upper.png"), read_image("lower.png"))
     assert list(map(str, lower.warnings())) == [
-        "the right picture lies 2.0 px lower; rectify the pair (rectify)"
+        "the right picture is 2.0 px lower than the left one; rectify the pair (rectify)"
     ]
     assert list(map(str, open_pictures([Path("both.png")]).notes)) == [
         "side_by_side, detected from name and content; override it if it is wrong (format)"
@@ -117,8 +116,8 @@ def test_a_pair_with_different_exposures_is_advised_to_lock_them():
         defects=("exposure",),
     )
     assert list(map(str, brighter.warnings())) == [
-        "the right picture has 2.0 times the other's exposure: depth is less reliable where either is too "
-        "dark or too bright; lock the exposure of both cameras"
+        "the right picture has 2.0 times the exposure of the other: depth is less reliable where either "
+        "picture is too dark or too bright; lock the exposure of both cameras"
     ]
 
 

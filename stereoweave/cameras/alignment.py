@@ -26,7 +26,7 @@ DEFECTS: tuple[Defect, ...] = get_args(Defect)
 SWAPPED = Note("left and right are swapped", Remedy("give them the other way round"))
 _RECTIFY = Remedy("rectify the pair", ("rectify",))
 
-# Tolerated vertical error; in larger pictures it grows with their side.
+# Tolerated vertical error; the tolerance grows with the side length of larger pictures.
 _TOLERATED_PX = 0.75
 _TOLERATED_DEGREES = 0.3
 _TOLERATED_STOPS = 0.58
@@ -37,7 +37,7 @@ _INLIER_PX = 1.5
 _FIRST_INLIER_PX = 2.5
 _TRIALS, _POLISHING = 400, 6
 _LEAST_MATCHES, _LEAST_INLIER_SHARE = 20, 0.2
-# A disparity counts if it agrees with at least this many of the match's neighbours.
+# A match's disparity counts if it agrees with the disparities of at least this many neighbours.
 _NEIGHBOURS, _LEAST_AGREEING = 8, 4
 _AGREE_PX, _AGREE_SHARE = 2.0, 0.05
 _OUTER_PERCENT = 1.0
@@ -47,7 +47,7 @@ _LIGHT_WINDOW_PX = 7
 _BLACK_LEVEL, _WHITE_LEVEL = 8, 250
 _GAMMA = 2.2
 
-# The vote of the depth order must be this clear to overrule the signs of the disparities.
+# The vote on the depth order must be this clear to overrule the signs of the disparities.
 _CLEAR_VOTE = 0.15
 
 
@@ -58,11 +58,11 @@ class Alignment:
     Attributes:
         matches: Number of matches.
         vertical_error_px, vertical_error_95_px: Median and 95th percentile of the vertical error.
-        vertical_shift_px: Vertical shift of the right image at its centre; positive if it is lower.
+        vertical_shift_px: Vertical shift of the right image at its centre; positive if that image is lower.
         rotation_degrees: Clockwise rotation of the right image.
-        range_px: Least and greatest disparity, without the outermost 1 %.
-        exposure_ratio: Exposure of the right image divided by that of the left one; NaN if unknown.
-        defects: Defects found, names in `DEFECTS`; empty for a sound pair.
+        range_px: Least and greatest disparity, without the outermost 1 % at each end.
+        exposure_ratio: Exposure of the right image divided by the left image's exposure; NaN if unknown.
+        defects: Names of the defects found, from `DEFECTS`; empty for a sound pair.
     """
 
     matches: int
@@ -81,7 +81,7 @@ class Alignment:
         least_px, greatest_px = self.range_px
         exposure = f"the right picture has {self.exposure_ratio:.2f} times the exposure of the left one"
         if math.isnan(self.exposure_ratio):
-            exposure = "unknown: matching areas are too dark or too bright"
+            exposure = "unknown, because matching areas are too dark or too bright"
         found = [
             f"vertical error at {self.matches} matches: median {self.vertical_error_px:.2f} px, "
             f"95 % below {self.vertical_error_95_px:.2f} px",
@@ -93,49 +93,55 @@ class Alignment:
         return [*map(Note, found), *(defects or [sound])]
 
     def warnings(self) -> list[Note]:
-        """Return notes on the defects that impair depth; negative disparities do not."""
+        """Return notes on the defects that impair depth: all except negative disparities."""
         return [self._note(defect) for defect in self.defects if defect != "negative_disparity"]
 
     def _note(self, defect: Defect) -> Note:
         match defect:
             case "too_few_matches":
                 return Note(
-                    f"expected two pictures of the same scene, found {self.matches} matching points: the "
-                    "pictures are too plain, too different or taken too far apart"
+                    f"expected two pictures of the same scene, found {self.matches} matching points; the "
+                    "pictures may be too plain, too different or taken from points too far apart"
                 )
             case "swapped":
                 return SWAPPED
             case "vertical_shift":
                 lower = "lower" if self.vertical_shift_px > 0 else "higher"
-                return Note(f"the right picture lies {abs(self.vertical_shift_px):.1f} px {lower}", _RECTIFY)
+                return Note(
+                    f"the right picture is {abs(self.vertical_shift_px):.1f} px {lower} than the left one",
+                    _RECTIFY,
+                )
             case "rotation":
                 way = "clockwise" if self.rotation_degrees > 0 else "anticlockwise"
                 return Note(
-                    f"the right picture is turned {abs(self.rotation_degrees):.1f} degrees {way}", _RECTIFY
+                    f"the right picture is rotated {abs(self.rotation_degrees):.1f} degrees {way}", _RECTIFY
                 )
             case "not_rectified":
                 return Note(
-                    f"the pair is not rectified: vertical errors reach {self.vertical_error_95_px:.1f} px "
-                    "(95 % of them are smaller) and vary over the picture",
+                    "the pair is not rectified: vertical errors vary over the picture, and 95 % of them are "
+                    f"below {self.vertical_error_95_px:.1f} px",
                     _RECTIFY,
                 )
             case "exposure":
                 ratio = max(self.exposure_ratio, 1 / self.exposure_ratio)
                 which = "right" if self.exposure_ratio > 1 else "left"
                 return Note(
-                    f"the {which} picture has {ratio:.1f} times the other's exposure: depth is less reliable "
-                    "where either is too dark or too bright",
+                    f"the {which} picture has {ratio:.1f} times the exposure of the other: depth is less "
+                    "reliable where either picture is too dark or too bright",
                     Remedy("lock the exposure of both cameras"),
                 )
             case "negative_disparity":
                 return Note(
-                    f"disparities go down to {self.range_px[0]:.0f} px, as in 3-D films: matching handles "
-                    "them, but metric depth from focal length and baseline also needs doffs"
+                    f"disparities go down to {self.range_px[0]:.0f} px, as in 3-D films: matching supports "
+                    "this, but metric depth requires doffs besides focal length and baseline"
                 )
 
 
 def check_pair(left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"]) -> Alignment:
-    """Measure the alignment of a pair, rectified or not, in 0.1 to 0.2 s at 640x480."""
+    """Measure the alignment of a pair, rectified or not.
+
+    This takes 0.1 to 0.2 s at 640x480.
+    """
     matches = find_matches(left, right)
     scale = max(1.0, (left.shape[0] * left.shape[1] / _PIXELS_OF_TOLERANCE) ** 0.5)
     count = len(matches.left_px)
@@ -186,7 +192,7 @@ def check_pair(left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3
 def _measure_range(
     disparity_px: Float[np.ndarray, " n"], negative_px: Float[np.ndarray, " m"]
 ) -> tuple[float, float]:
-    """Return the disparity range without the outermost 1 %; ignore negative values if none is reliable."""
+    """Return the disparity range without 1 % at each end; ignore negative values if none are reliable."""
     at_least_0 = disparity_px[disparity_px >= 0]
     counted_px = disparity_px if len(negative_px) or not len(at_least_0) else at_least_0
     least_px, greatest_px = np.percentile(counted_px, [_OUTER_PERCENT, 100 - _OUTER_PERCENT])
@@ -212,10 +218,10 @@ def _make_unrelated(matches: int) -> Alignment:
 def _fit_vertical_error(
     matches: Matches, centre_px: Float[np.ndarray, " 2"], scale: float
 ) -> tuple[Bool[np.ndarray, " n"], float, float, float] | None:
-    """Fit the vertical error; return inliers, shift in px, slope, and size of the remaining terms in px.
+    """Fit the vertical error; return inliers, shift in px, slope and the size of the other terms in px.
 
     The vertical error is a field over the right picture. Its constant term is a shift, and its term in x is a
-    rotation. Scale, pitch and convergence cause the other terms up to second order. Returns None if no field
+    rotation. Scale, pitch and convergence cause the other terms, up to second order. Returns None if no field
     explains enough matches.
     """
     x, y = ((matches.right_px - centre_px) / centre_px[0]).T
@@ -223,7 +229,7 @@ def _fit_vertical_error(
     lower_px = matches.lower_px
     inliers = _find_plane_inliers(terms[:, :3], lower_px, scale * _FIRST_INLIER_PX)
     for _ in range(_POLISHING):
-        # The ridge keeps terms that few matches support small.
+        # The ridge limits terms that only a few matches support.
         weights, ridge = terms[inliers], 0.1 * np.eye(6)
         field = np.linalg.solve(weights.T @ weights + ridge, weights.T @ lower_px[inliers])
         inliers = np.abs(terms @ field - lower_px) <= scale * _INLIER_PX
@@ -236,7 +242,7 @@ def _fit_vertical_error(
 def _find_plane_inliers(
     terms: Float[np.ndarray, "n 3"], values: Float[np.ndarray, " n"], tolerated: float
 ) -> Bool[np.ndarray, " n"]:
-    """Return the inliers of the best plane: the zero plane, or one through three random values (RANSAC)."""
+    """Return the inliers of the best plane by RANSAC; the zero plane is one of the candidates."""
     rng = np.random.default_rng(0)
     picked = rng.integers(0, len(values), (_TRIALS, 3))
     through = terms[picked]
@@ -251,14 +257,14 @@ def _find_plane_inliers(
 def _find_supported(
     matches: Matches, disparity_px: Float[np.ndarray, " n"], scale: float
 ) -> Bool[np.ndarray, " n"]:
-    """Return the mask of matches whose disparity agrees with enough of their neighbours."""
+    """Return the mask of matches whose disparity agrees with the disparities of enough neighbours."""
     squared = (matches.left_px**2).sum(1)
     apart = squared[:, None] + squared - 2 * matches.left_px @ matches.left_px.T
     count = min(_NEIGHBOURS + 1, len(apart))
     nearest = np.argpartition(apart, count - 1, axis=1)[:, :count]
     tolerated_px = _AGREE_PX * scale + _AGREE_SHARE * np.abs(disparity_px)
     agreeing = np.abs(disparity_px[nearest] - disparity_px[:, None]) <= tolerated_px[:, None]
-    return agreeing.sum(1) - 1 >= _LEAST_AGREEING  # each agrees with itself
+    return agreeing.sum(1) - 1 >= _LEAST_AGREEING  # each match agrees with itself
 
 
 def _measure_light_ratio(
@@ -275,7 +281,7 @@ def _measure_light_ratio(
 def _sample_levels(
     image: UInt8[np.ndarray, "h w 3"], places_px: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, "3 n"]:
-    """Return the dark, middle and bright level of the strongest channel around each point, clipped or not."""
+    """Return the 15th, 50th and 85th percentiles of the strongest channel around each point."""
     offsets = np.arange(_LIGHT_WINDOW_PX) - _LIGHT_WINDOW_PX // 2
     height, width = image.shape[:2]
     nearest = np.rint(places_px).astype(int)

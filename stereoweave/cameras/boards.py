@@ -15,14 +15,14 @@ _FEWEST_CORNERS = 8
 
 @dataclass(frozen=True, kw_only=True)
 class Board:
-    """A printed chessboard, or a ChArUco board if it has a dictionary of markers.
+    """A printed chessboard, or a ChArUco board if `dictionary` is given.
 
     Attributes:
-        columns, rows: Number of inner corners of a chessboard, where four squares meet, or number of squares
-            of a ChArUco board, as in OpenCV.
-        square_m: Side of a square.
-        marker_m: Side of a marker of a ChArUco board.
-        dictionary: OpenCV's name of the marker dictionary, such as DICT_5X5_100.
+        columns, rows: As in OpenCV, number of inner corners of a chessboard, where four squares meet, or
+            number of squares of a ChArUco board.
+        square_m: Side length of a square.
+        marker_m: Side length of a marker on a ChArUco board.
+        dictionary: OpenCV's name for the marker dictionary, such as DICT_5X5_100.
     """
 
     columns: int
@@ -34,17 +34,18 @@ class Board:
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < 3 or not self.square_m > 0:
             raise StereoweaveError(
-                "expected a board of at least 3x3 corners and squares with a side above 0 mm, "
-                f"found {self.columns}x{self.rows} and {1000 * self.square_m:g} mm"
+                "expected a board of at least 3x3 with squares larger than 0 mm, "
+                f"found {self.columns}x{self.rows} with squares of {1000 * self.square_m:g} mm"
             )
         if (self.marker_m is None) != (self.dictionary is None):
             raise StereoweaveError(
-                "expected both the dictionary and the size of a ChArUco board's markers, found only one"
+                "expected both the dictionary and the size of a ChArUco board's markers, "
+                "found only one of them"
             )
         if self.marker_m is not None and not 0 < self.marker_m < self.square_m:
             raise StereoweaveError(
-                f"expected markers smaller than the squares of {1000 * self.square_m:g} mm, "
-                f"found {1000 * self.marker_m:g} mm"
+                f"expected markers smaller than the squares ({1000 * self.square_m:g} mm), "
+                f"found markers of {1000 * self.marker_m:g} mm"
             )
         if self.dictionary is not None and not hasattr(cv2.aruco, self.dictionary):
             names = ", ".join(name for name in dir(cv2.aruco) if name.startswith("DICT_"))
@@ -70,7 +71,7 @@ class Board:
 
 
 class PairCorners(NamedTuple):
-    """Corners visible in both pictures of a pair: their numbers on the board, and x and y in px."""
+    """Corners visible in both pictures of a pair: their indices on the board, and x and y in px."""
 
     name: str
     corners: Int[np.ndarray, " n"]
@@ -79,7 +80,7 @@ class PairCorners(NamedTuple):
 
 
 class ViewCorners(NamedTuple):
-    """Corners in one view: their numbers on the board, and x and y in px."""
+    """Corners in one view: their indices on the board, and x and y in px."""
 
     corners: Int[np.ndarray, " n"]
     at_px: Float[np.ndarray, "n 2"]
@@ -95,7 +96,7 @@ def find_pair_corners(
     """
     if left.shape != right.shape:
         sizes = [format_size(image.shape[::-1]) for image in (left, right)]
-        raise FormatError(f"the left picture has {sizes[0]} pixels, the right one {sizes[1]}")
+        raise FormatError(f"the left picture has {sizes[0]} pixels, but the right one has {sizes[1]}")
     find = _find_charuco if board.dictionary else _find_chessboard
     found = [find(image, board) for image in (left, right)]
     nowhere = [side for side, corners in zip(("left", "right"), found, strict=True) if corners is None]
@@ -129,7 +130,7 @@ def _find_charuco(image: UInt8[np.ndarray, "h w"], board: Board) -> ViewCorners 
 
 
 def reorder_corners(here: ViewCorners, there: ViewCorners, board: Board) -> ViewCorners:
-    """Reorder the right corners like the left ones, because a chessboard has no orientation mark."""
+    """Reorder the right corners to match the left ones, because a chessboard has no orientation mark."""
     grid = there.at_px.reshape(board.rows, board.columns, 2)
     turns = (0, 1, 2, 3) if board.rows == board.columns else (0, 2)
     orders = [np.rot90(grid, turn).reshape(-1, 2) for turn in turns]

@@ -18,7 +18,7 @@ from stereoweave.io.decoding import ENDINGS
 from stereoweave.io.images import read_image
 
 FEWEST_PAIRS = 5
-# A pair with an error of more than this many times the median has a misdetected corner, or was taken in
+# A pair with an error of more than this many times the median has a misdetected corner or was taken in
 # motion.
 _OUTLIER = 3.0
 _GOOD_PX, _FAIR_PX = 0.5, 1.0
@@ -37,7 +37,7 @@ class _Solution(NamedTuple):
     Attributes:
         rig: The two cameras.
         turns: Rotation vector of the board in each pair, relative to the left camera.
-        errors_px: RMS reprojection error of each pair, left and right.
+        errors_px: RMS reprojection error of each pair in the left and the right picture.
     """
 
     rig: Rig
@@ -51,12 +51,12 @@ class Calibration:
 
     Attributes:
         rig: The two cameras.
-        left_error_px, right_error_px: RMS reprojection error.
+        left_error_px, right_error_px: RMS reprojection error in each view.
         epipolar_error_px: Median distance of a right corner from the epipolar line of its left corner.
         cover_percent: Share of the picture that the boards cover, in the view with the smaller share.
         tilt_degrees: Angle between the optical axis and the normal of the most tilted board.
         used: Names of the pairs used.
-        left_out: Reason for each picture or pair left out, by name.
+        left_out: Reason for leaving out each omitted picture or pair, by name.
     """
 
     rig: Rig
@@ -100,7 +100,10 @@ class Calibration:
                 "near the edges",
             )
         if self.tilt_degrees < _GOOD_TILT_DEGREES:
-            yield True, f"no board is tilted by {_GOOD_TILT_DEGREES} degrees: add pictures of a tilted board"
+            yield (
+                True,
+                f"no board is tilted by {_GOOD_TILT_DEGREES} degrees or more: add pictures of a tilted board",
+            )
         if len(self.used) < _GOOD_PAIRS:
             yield False, f"few pairs: use {_GOOD_PAIRS} or more"
 
@@ -114,7 +117,7 @@ class Calibration:
             f"{self.rig.rotation_degrees:.2f} degrees relative to each other",
             f"reprojection error {self.error_px:.2f} px (left {self.left_error_px:.2f}, right "
             f"{self.right_error_px:.2f}), epipolar error {self.epipolar_error_px:.2f} px (median)",
-            f"boards cover {self.cover_percent:.0f} % of the picture, tilted by up to "
+            f"boards cover {self.cover_percent:.0f} % of the picture and are tilted by up to "
             f"{self.tilt_degrees:.0f} degrees",
             self.verdict,
         ]
@@ -127,21 +130,22 @@ def calibrate(
     fisheye: bool = False,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Calibration:
-    """Calibrate the rig from a folder of board pictures.
+    """Calibrate a rig from a folder of board pictures.
 
-    Two pictures are a pair if their paths differ only in left and right, L and R, or cam0 and cam1:
-    left/01.png and right/01.png, left01.png and right01.png, 01_L.png and 01_R.png. A pair is left out and
-    reported if a picture is damaged or lacks the board, or if its error exceeds three times the median.
+    Two pictures form a pair if their paths differ only in left and right, L and R, or cam0 and cam1. Examples
+    are left/01.png and right/01.png, left01.png and right01.png, and 01_L.png and 01_R.png. A pair is left
+    out and reported if a picture is damaged or lacks the board, or if the pair's error exceeds three times
+    the median.
 
     Args:
-        folder: Folder of the pictures.
+        folder: Folder with the pictures.
         board: The printed board.
         fisheye: Use the fisheye model of Kannala and Brandt instead of a pinhole with distortion
             k1 k2 p1 p2 k3.
         progress: Called with the name of each pair before its corners are detected.
 
     Raises:
-        StereoweaveError: The folder does not exist, or it has fewer than FEWEST_PAIRS usable pairs.
+        StereoweaveError: The folder does not exist, or it contains fewer than FEWEST_PAIRS usable pairs.
     """
     pairs, left_out = find_pairs(Path(folder))
     seen, size_px = _find_all_corners(pairs, board, left_out, progress)
@@ -152,7 +156,7 @@ def calibrate(
             solution = solve(board.corners_m(), seen, size_px)
         except cv2.error as error:
             raise StereoweaveError(
-                f"{folder}: expected pictures sufficient for calibration, found {len(seen)} pairs for which "
+                f"{folder}: expected pairs that suffice for a calibration, found {len(seen)} pairs for which "
                 f"OpenCV fails ({error.err}); add pictures with the board tilted and near the edges"
             ) from error
         worst_px = solution.errors_px.max(axis=1)
@@ -178,9 +182,9 @@ def _check_enough(count: int, total: int, board: Board, left_out: Mapping[str, s
 
 
 def find_pairs(folder: Path) -> tuple[dict[str, tuple[Path, Path]], dict[str, str]]:
-    """Return the left and right picture of each pair, by name, and the reason for each picture left out."""
+    """Return both pictures of each pair, by name, and the reason for each picture that is left out."""
     if not folder.is_dir():
-        raise StereoweaveError(f"{folder}: expected a folder with pictures of a board, found none")
+        raise StereoweaveError(f"{folder}: expected a folder with pictures of a board, found no such folder")
     sides: dict[str, dict[bool, Path]] = {}
     for path in sorted(folder.rglob("*")):
         relative = path.relative_to(folder).with_suffix("").as_posix()
@@ -208,7 +212,7 @@ def _find_all_corners(
     left_out: dict[str, str],
     progress: Callable[[str], None],
 ) -> tuple[list[PairCorners], Size]:
-    """Find the corners in every pair; return those of the pairs of the most common size, and that size."""
+    """Find the corners in every pair; return the corners in pairs of the most common size, and that size."""
     seen: list[tuple[PairCorners, Size]] = []
     for name, paths in pairs.items():
         progress(name)
@@ -342,7 +346,7 @@ def _undistort(optics: Optics, at_px: Float[np.ndarray, "n 2"]) -> Float[np.ndar
 
 
 def _measure_cover_percent(views: Sequence[Float[np.ndarray, "_ 2"]], size_px: Size) -> float:
-    """Return the share of the picture that lies inside the boards' convex hulls."""
+    """Return the percentage of the picture that lies inside the boards' convex hulls."""
     covered = np.zeros(size_px[::-1], np.uint8)
     for at_px in views:
         outline = cv2.convexHull(at_px.astype(np.float32))

@@ -25,7 +25,7 @@ _YES, _NO = ("true", "yes", "on", "y"), ("false", "no", "off", "n")
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 _FISHEYE_NAMES = {"fisheye", "equidistant", "equi", "kannalabrandt", "kb4"}
 _PINHOLE_NAMES = {"pinhole", "radtan", "plumbbob", "rationalpolynomial", "brownconrady", "none"}
-# NumPy types by OpenCV's type names: for base64 data, and for decimal data that OpenCV rounds to the type.
+# NumPy types by OpenCV's type names, for base64 data and for decimal data that OpenCV rounds to that type.
 _BASE64_TYPES = {"u": "u1", "c": "i1", "w": "<u2", "s": "<i2", "i": "<i4", "f": "<f4", "d": "<f8"}
 _ROUNDED = {"h": np.float16, "f": np.float32}
 _HEXADECIMAL = re.compile(r"[-+]?0[xX][0-9a-fA-F]{1,16}")
@@ -33,28 +33,27 @@ _EXPECTED = "a calibration of two cameras (OpenCV's YAML or XML, Kalibr's camcha
 
 
 def read_rig(path: str | Path, size_px: Size | None = None) -> Rig:
-    """Read the rig of a calibration file; the format is detected from the content.
+    """Read the rig from a calibration file, whose format is detected from the content.
 
     Formats:
-        OpenCV's YAML, XML or JSON (cv2.FileStorage), with the names of its examples (M1 D1 M2 D2 R T) or
-        common variants such as K1 or cameraMatrix1. An extrinsics.yml is completed by the intrinsics.yml
-        beside it, and vice versa. The format does not state its unit of length: without an entry
-        translation_unit (m, cm or mm), a translation longer than 2 is taken to be in millimetres, a shorter
-        one in metres. Nor does it state the lens model: without an entry distortion_model, the lens is taken
-        to be a pinhole.
+        OpenCV's YAML, XML or JSON (cv2.FileStorage), with the entry names in OpenCV's examples (M1, D1, M2,
+        D2, R and T) or common variants such as K1 or cameraMatrix1. An extrinsics.yml is completed by the
+        intrinsics.yml beside it, and vice versa. If there is no entry translation_unit (m, cm or mm), a
+        translation longer than 2 is assumed to be in millimetres and a shorter translation in metres. If
+        there is no entry distortion_model, the lens is assumed to be a pinhole.
         Kalibr's camchain.yaml, with cam0 as the left camera and cam1 as the right one.
         KITTI's calib.txt (P0 to P3) and calib_cam_to_cam.txt; the colour cameras 2 and 3 are used if present.
         Middlebury's calib.txt.
 
     Args:
         path: The file.
-        size_px: Width and height of the pictures. KITTI's calib_cam_to_cam.txt also has a calibration of the
+        size_px: Width and height of the pictures. KITTI's calib_cam_to_cam.txt also has a calibration for the
             raw pictures, which is used if the pictures have the raw size.
 
     Raises:
         FormatError: The file is missing, not regular or larger than 256 KB; an entry is missing or invalid;
-            the content is nested more than 20 deep, or has more than 10,000 values, an anchor, an alias or
-            a DTD.
+            or the content is nested more than 20 levels deep or has more than 10,000 values, an anchor, an
+            alias or a DTD.
     """
     # Overflows and divisions by 0 give values that are not finite, which are rejected at the end.
     with reading(path, _EXPECTED), np.errstate(all="ignore"):
@@ -81,19 +80,22 @@ def read_calibration_bytes(path: str | Path) -> bytes:
 
 
 def add_camera(pair: StereoPair, path: str | Path) -> StereoPair:
-    """Return the rectified pair with the camera of a calibration file for pictures of the same size."""
+    """Return a rectified pair with the camera from a calibration file for pictures of the same size."""
     rig = read_rig(path, pair_size_px(pair))
     rig.check_size(pair)
     return replace(pair, camera=rig.camera())
 
 
 def write_rig(path: str | Path, rig: Rig) -> None:
-    """Write a rig as OpenCV's YAML, which cv2.FileStorage reads and `read_rig` restores exactly.
+    """Write a rig as OpenCV's YAML, from which `read_rig` restores the rig exactly.
 
-    The entries are image_width, image_height, distortion_model, M1, D1, M2, D2, R, T and translation_unit.
+    OpenCV's cv2.FileStorage also reads the file. The entries are image_width, image_height, distortion_model,
+    M1, D1, M2, D2, R, T and translation_unit.
     """
     if rig.left.fisheye != rig.right.fisheye:
-        raise StereoweaveError(f"{path}: expected two lenses of the same model, found pinhole and fisheye")
+        raise StereoweaveError(
+            f"{path}: expected two lenses of the same model, found a pinhole and a fisheye lens"
+        )
     storage = cv2.FileStorage(".yml", cv2.FileStorage_WRITE | cv2.FileStorage_MEMORY)
     if rig.size_px is not None:
         storage.write("image_width", rig.size_px[0])
@@ -117,7 +119,7 @@ def _read_text(path: Path) -> str:
 
 
 def _add_companion(entries: dict[str, Any], path: Path) -> dict[str, Any]:
-    """Add the entries of the companion file if `path` is an intrinsics or extrinsics file that has one."""
+    """Add the entries of the companion file, if any, to those of an intrinsics or extrinsics file."""
     for this, other in (("intrinsics", "extrinsics"), ("extrinsics", "intrinsics")):
         beside = path.with_name(path.name.replace(this, other))
         if this in path.name and beside.exists():
@@ -127,7 +129,7 @@ def _add_companion(entries: dict[str, Any], path: Path) -> dict[str, Any]:
 
 
 def _parse_opencv(entries: Mapping[str, Any]) -> Rig:
-    # Names vary in case and separators: camera_matrix_left, cameraMatrixLeft.
+    # Names vary in case and separators: for example, camera_matrix_left and cameraMatrixLeft.
     plain = {_normalise_name(key): value for key, value in entries.items()}
     parts = _parse_opencv_parts(plain)
     model = _find_model(plain)
@@ -159,7 +161,7 @@ def _parse_opencv(entries: Mapping[str, Any]) -> Rig:
 
 
 def _parse_opencv_parts(plain: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Return intrinsics and extrinsics, stored under any of their known names."""
+    """Return the intrinsics and extrinsics, whichever of their known names the file uses."""
     found = {
         f"{what} {side}": _find_side(plain, names, sides)
         for side, sides in (("left", ("1", "left", "l")), ("right", ("2", "right", "r")))
@@ -172,7 +174,7 @@ def _parse_opencv_parts(plain: Mapping[str, Any]) -> dict[str, np.ndarray]:
     found["translation"] = _find_first(plain, ("t", "translation", "translationvector", "trans"))
     missing = [name for name, value in found.items() if value is None]
     if missing:
-        raise ValueError(f"no entry for {', '.join(missing)} (M1 D1 M2 D2 R T)")
+        raise ValueError(f"no entry for {', '.join(missing)} (M1, D1, M2, D2, R and T are required)")
     return {name: _parse_numbers(value) for name, value in found.items()}
 
 
@@ -190,7 +192,7 @@ def _find_side(entries: Mapping[str, Any], names: Iterable[str], sides: Iterable
 
 
 def _find_model(entries: Mapping[str, Any]) -> str | None:
-    """Return the lens model of an OpenCV file, fisheye or pinhole; None if the file does not state it."""
+    """Return the lens model in an OpenCV file, fisheye or pinhole; None if the file does not state it."""
     if _parse_bool(_find_first(entries, ("fisheyemodel", "fisheye")) or "no"):
         return "fisheye"
     named = _find_first(entries, ("distortionmodel", "cameramodel", "model"))
@@ -214,7 +216,7 @@ def _parse_model(named: object) -> str:
     if word in _PINHOLE_NAMES:
         return "pinhole"
     raise ValueError(
-        f"unknown lens model {reprlib.repr(named)}; use radtan (pinhole) or equidistant (fisheye)"
+        f"the unknown lens model {reprlib.repr(named)}; use radtan (pinhole) or equidistant (fisheye)"
     )
 
 
@@ -272,7 +274,7 @@ def _parse_kalibr_optics(name: str, entries: Mapping[str, Any]) -> Optics:
     camera, intrinsics = entries.get("camera_model", "pinhole"), _parse_numbers(entries["intrinsics"])
     if camera != "pinhole" or intrinsics.size != 4:
         raise ValueError(
-            f"unsupported camera model {reprlib.repr(camera)} of {name}; "
+            f"the unsupported camera model {reprlib.repr(camera)} in {name}; "
             "calibrate with pinhole-radtan or pinhole-equi"
         )
     fisheye = _parse_model(entries.get("distortion_model", "radtan")) == "fisheye"
@@ -297,7 +299,7 @@ def _parse_kitti(text: str, size_px: Size | None) -> Rig:
         if re.match(r"[PKDRTS]_?(rect_)?\d", key.strip())
     }
     first, second = (2, 3) if {"P3", "P_rect_03", "K_03"} & rows.keys() else (0, 1)
-    notes = (Note(f"KITTI's camera {first} is used as the left one, camera {second} as the right one"),)
+    notes = (Note(f"KITTI's camera {first} is used as the left one and camera {second} as the right one"),)
     raw_px = _find_kitti_size(rows, f"S_{first:02}")
     keys = (f"P_rect_{first:02}", f"P_rect_{second:02}")
     if keys[0] not in rows:
@@ -313,7 +315,7 @@ def _parse_kitti(text: str, size_px: Size | None) -> Rig:
 
 
 def _make_kitti_raw_rig(rows: Mapping[str, Float[np.ndarray, " _"]], first: str, second: str) -> Rig:
-    """Return the rig of KITTI's raw pictures; the file's poses are relative to camera 0."""
+    """Return the rig for KITTI's raw pictures; the file's poses are relative to camera 0."""
     left, right = (
         Optics(
             matrix=_require_kitti_row(rows, f"K_{number}").reshape(3, 3),
@@ -345,9 +347,9 @@ def _find_kitti_size(rows: Mapping[str, Float[np.ndarray, " _"]], key: str) -> S
 
 
 def _parse_middlebury(text: str) -> Rig:
-    """Parse Middlebury's calib.txt: cam0=[f 0 cx; 0 f cy; 0 0 1], the baseline in millimetres.
+    """Parse Middlebury's calib.txt, with cam0=[f 0 cx; 0 f cy; 0 0 1] and the baseline in millimetres.
 
-    Source: the Middlebury datasets of 2014.
+    Source: the Middlebury stereo datasets of 2014.
     """
     lines = (line.split("=", 1) for line in text.splitlines() if "=" in line)
     entries = {key.strip(): value for key, value in lines}
@@ -359,7 +361,7 @@ def _parse_middlebury(text: str) -> Rig:
     right = left + np.array([[0, 0, float(entries["doffs"])], [0, 0, 0], [0, 0, 0]])
     baseline_m = float(entries["baseline"]) / 1000
     if not baseline_m > 0:
-        raise ValueError(f"a baseline of {entries['baseline']} instead of a positive one")
+        raise ValueError(f"a baseline of {entries['baseline']}, which is not positive")
     size_px = int(entries["width"]), int(entries["height"])
     return replace(make_rectified_rig(left, right, -baseline_m), size_px=size_px)
 
@@ -369,7 +371,7 @@ def _make_camera_matrix(fx: float, fy: float, cx: float, cy: float) -> Float[np.
 
 
 def _parse_numbers(values: Any) -> Float[np.ndarray, "..."]:
-    """Parse the numbers of an entry: a single number, a list, a list of rows, or OpenCV's matrix."""
+    """Parse the numbers of an entry: a single number, a list, a list of rows, or an OpenCV matrix."""
     if isinstance(values, dict) and "data" in values:
         return _parse_matrix(values)
     if isinstance(values, str) and values.startswith(BASE64):
@@ -388,10 +390,10 @@ def _parse_hexadecimal(values: Any) -> Any:
 
 
 def _parse_matrix(entries: Mapping[str, Any]) -> Float[np.ndarray, "..."]:
-    """Parse OpenCV's matrix to the same values as cv2.FileStorage does, in float64."""
+    """Parse an OpenCV matrix to float64, with the same values as cv2.FileStorage."""
     written = re.fullmatch(r"(\d*)([A-Za-z])", str(entries.get("dt", "d")))
     if written is None:
-        raise ValueError(f"unsupported matrix type {reprlib.repr(entries['dt'])}")
+        raise ValueError(f"the unsupported matrix type {reprlib.repr(entries['dt'])}")
     numbers = _parse_numbers(entries["data"])
     if written[2] in _ROUNDED:
         numbers = numbers.astype(_ROUNDED[written[2]]).astype(np.float64)
@@ -410,5 +412,5 @@ def _decode_base64(data: str) -> Float[np.ndarray, " _"]:
     content = base64.b64decode(data.removeprefix(BASE64))
     written = re.fullmatch(rb"\d*([a-z]) *", content[:24])
     if written is None or written[1].decode() not in _BASE64_TYPES:
-        raise ValueError(f"unsupported base64 type {content[:24]!r}")
+        raise ValueError(f"the unsupported base64 type {content[:24]!r}")
     return np.frombuffer(content, _BASE64_TYPES[written[1].decode()], offset=24).astype(np.float64)

@@ -1,4 +1,4 @@
-"""Diagnosis of a matched pair: notes on defects that the user should know."""
+"""Diagnosis of a matched pair: notes on defects that the user should know about."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from stereoweave.errors import Note, Remedy
 from stereoweave.stereo import Estimate, StereoPair
 
 _CONFIDENT = 0.5
-# Sound pairs have at least 64 % confident pixels; noise and plain pictures at most 12 %.
+# Sound pairs have at least 64 % confident pixels; noise and plain pictures have at most 12 %.
 _LEAST_CONFIDENT_PERCENT = 30.0
 
 
@@ -27,8 +27,8 @@ def find_problems(pair: StereoPair, estimate: Estimate) -> list[Note]:
     if confident_percent < _LEAST_CONFIDENT_PERCENT:
         return [
             Note(
-                f"only {confident_percent:.0f} % of the disparities are confident: the pictures are too "
-                "plain, show different scenes, are swapped or are not rectified",
+                f"only {confident_percent:.0f} % of the disparities are confident: the pictures may be too "
+                "plain, show different scenes, be swapped or not be rectified",
                 Remedy("rectify the pair", ("rectify",)),
             )
         ]

@@ -1,7 +1,7 @@
 """Detection of negative disparities, and of the depth order at occlusions.
 
 Parallel cameras give disparities of 0 or more. Converged cameras and swapped pictures also give negative
-ones.
+disparities.
 """
 
 import cv2
@@ -10,19 +10,19 @@ from jaxtyping import Bool, Float, Float32, UInt8
 
 # A disparity below this is negative.
 _NEGATIVE_PX = -1.5
-# At most this many points are tested, of which at least this many must be certain.
+# At most this many points are tested, and at least this many of them must be certain.
 _MOST_TRIED, _LEAST_SURE = 150, 4
-# A point is certain if its window correlates this well with its match, and much less with any window at a
-# disparity of 0 or more.
+# A point is certain if its window correlates at least this well with its match, and much less with any window
+# at a disparity of 0 or more.
 _LEAST_LIKENESS, _MOST_AMBIGUOUS = 0.9, 0.7
-# Difference between identical windows that rounded grey levels cause.
+# Difference between identical windows caused by the rounding of grey levels.
 _ROUNDING = 0.003
 # Search range for the best window, as a share of the width.
 _REACH = 0.45
 _RADIUS_PX = 7
 
-# Areas without corners are matched densely at this width and over this range. Points of larger disparity have
-# corners or no texture at all.
+# Areas without corners are matched densely at this width and over this range. Points with larger disparities
+# have either corners or no texture at all.
 _DENSE_WIDTH_PX, _DENSE_RANGE_PX = 160, (-5.0, 53.0)
 _DENSE_NEGATIVE_PX, _DENSE_RADIUS_PX = -0.5, 4
 _LEAST_TEXTURE_LEVELS = 1.0
@@ -31,7 +31,7 @@ _LEAST_TEXTURE_LEVELS = 1.0
 _OCCLUSION_WIDTH_PX = 320
 _BLOCK_PX, _MARGIN_PX = 5, 3
 _LEAST_JUMP_PX, _LEAST_COLOUR_STEP, _BESIDE_PX = 2.0, 10.0, 3
-# Number of neutral votes added, as regularisation.
+# Number of neutral votes added for regularisation.
 _VOTES_OF_DOUBT = 20
 
 
@@ -41,18 +41,18 @@ def find_negative_disparities(
     places_px: Float[np.ndarray, "n 2"],
     disparity_px: Float[np.ndarray, " n"],
 ) -> Float[np.ndarray, " m"]:
-    """Return the negative disparities in px that are certain: no positive match is plausible.
+    """Return the negative disparities in px for which no positive match is plausible.
 
     Returns an empty array if there are too few. On repeated structures, such as a truss, matches can be off
-    by a period. A positive candidate that fits about as well is then preferred, because parallel pairs are
+    by one period. A positive candidate that fits about as well is then preferred, because parallel pairs are
     far more common than converged ones.
 
     Args:
         left: Left image of a rectified pair, uint8 RGB [H, W, 3].
         right: Right image of the same size.
         places_px: Columns and rows of points in the left image.
-        disparity_px: Disparity at these points. If too few of them are certain, areas without corners are
-            also matched, densely.
+        disparity_px: Disparities in px at these points. If too few are certain, areas without corners are
+            matched densely as well.
     """
     negative = disparity_px < _NEGATIVE_PX
     greys = cv2.cvtColor(left, cv2.COLOR_RGB2GRAY), cv2.cvtColor(right, cv2.COLOR_RGB2GRAY)
@@ -70,7 +70,7 @@ def find_negative_disparities(
 def _find_dense_negative(
     left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"]
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
-    """Return the points of the left picture to which semi-global matching gives a negative disparity."""
+    """Return the left picture's points with negative semi-global disparities, and these disparities."""
     disparity_px, seen = _match_densely(left, right, *_DENSE_RANGE_PX)
     slope = cv2.Sobel(cv2.cvtColor(left, cv2.COLOR_RGB2GRAY), cv2.CV_32F, 1, 0, scale=1 / 8)
     textured = cv2.blur(np.abs(slope), (_BLOCK_PX, _BLOCK_PX)) > _LEAST_TEXTURE_LEVELS
@@ -85,7 +85,7 @@ def _select_certain(
     disparity_px: Float[np.ndarray, " n"],
     radius_px: int,
 ) -> Float[np.ndarray, " m"]:
-    """Return the unambiguous disparities among a sample of the given ones, checked in both directions."""
+    """Sample the given disparities, and return those that are unambiguous in both directions."""
     step = max(1, -(-len(places_px) // _MOST_TRIED))
     disparity_px = disparity_px[::step]
     columns, rows = np.rint(places_px[::step]).astype(int).T
@@ -110,14 +110,14 @@ def _is_unambiguous(
     reach_px: int,
     radius_px: int,
 ) -> bool:
-    """Return whether a window correlates with its match and with no window at a positive disparity.
+    """Return whether a window correlates with its match but with no window at a positive disparity.
 
     Args:
         own: The picture with the window, padded by a border of `radius_px` + 1.
         other: The other picture, padded by the same border.
-        place: Row and column of the window and column of its match, without the border.
-        reach_px: Search range of positive disparities: negative (to the left) in the right picture, positive
-            in the left one.
+        place: Row and column of the window, and column of its match, not counting the border.
+        reach_px: Search range for positive disparities; negative, to the left, if `other` is the right
+            picture, and positive if it is the left one.
         radius_px: Radius of the window.
     """
     row, column, partner = place
@@ -136,17 +136,18 @@ def _is_unambiguous(
 def _cut_strip(
     bordered: UInt8[np.ndarray, "h w"], row: int, first: int, last: int, radius_px: int
 ) -> UInt8[np.ndarray, "h2 w2"]:
-    """Return the strip that windows around the columns cover, with one more row above and below."""
+    """Return the strip that the windows around columns first..last cover, plus one row above and below."""
     return bordered[row : row + 2 * radius_px + 3, first + 1 : last + 2 * radius_px + 2]
 
 
 def estimate_depth_order(
     left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"], range_px: tuple[float, float]
 ) -> float:
-    """Return the depth order, -1..1: positive if greater disparities occlude smaller ones, else negative.
+    """Return the depth order in -1..1: positive if greater disparities occlude smaller ones, else negative.
 
-    In the left picture, an area that is occluded in the right one lies between a surface of smaller and one
-    of greater disparity. It belongs to the farther surface and has its colour.
+    In the left picture, an area that is occluded in the right one lies between a surface of smaller
+    disparity and a surface of greater disparity. The area belongs to the farther surface and has the same
+    colour.
     """
     factor = min(1.0, _OCCLUSION_WIDTH_PX / left.shape[1])
     small_left, small_right = (_shrink(image, factor) for image in (left, right))
@@ -161,7 +162,7 @@ def estimate_depth_order(
 def _vote_in_row(
     disparity_px: Float32[np.ndarray, " w"], seen: Bool[np.ndarray, " w"], colours: Float32[np.ndarray, "w 3"]
 ) -> list[float]:
-    """Return a vote in -1..1 for each occluded run of a row: positive if its left side is more similar."""
+    """Return a vote in -1..1 for each occluded run in a row: positive if the run resembles its left side."""
     votes = []
     changes = np.diff(seen.astype(np.int8))
     ends = np.flatnonzero(changes == 1) + 1
@@ -183,7 +184,7 @@ def _vote_in_row(
 def _match_densely(
     left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"], least_px: float, greatest_px: float
 ) -> tuple[Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """Return the left disparity by semi-global matching, and the mask that passes the left-right check."""
+    """Return the semi-global left disparity and the mask of pixels that pass the left-right check."""
     first_px = int(np.floor(least_px)) - _MARGIN_PX
     count = int(np.ceil((greatest_px + _MARGIN_PX - first_px) / 16)) * 16
     penalty = _BLOCK_PX**2

@@ -1,8 +1,8 @@
-"""Sparse feature matches between two pictures of one scene, rectified or not.
+"""Sparse feature matches between two pictures of the same scene, rectified or not.
 
 A corner is described by a small window of grey levels, normalised for brightness and contrast. Two corners
 match if each is clearly the other's best candidate. This takes a twentieth of the time of SIFT (15 ms versus
-300 ms at 640x480), with nearly as many correct matches (82 versus 86 %, median over rendered rooms). It
+300 ms at 640x480), with nearly as many correct matches (82 % versus 86 %, median over rendered rooms). It
 tolerates rotations up to about 10 degrees and scale differences up to about 15 %, which is more than occurs
 in rigs or between two hand-held pictures.
 """
@@ -26,14 +26,14 @@ _LEAST_CORRELATION = 0.5
 _MOST_AMBIGUOUS = 0.85
 # Largest vertical offset of a match, as a share of the height.
 _MOST_ROWS_OFF = 0.25
-# Windows for the refinement of matches at full resolution, and the number of steps.
+# Radius of the windows for the refinement of matches at full resolution, and the number of steps.
 _EXACT_RADIUS, _EXACT_STEPS = 6, 8
 _CONVERGED_PX, _LEAST_EXACT_CORRELATION = 0.05, 0.7
 _WEAK_CONTRAST_LEVELS = 1.0
 
 
 class Matches(NamedTuple):
-    """N matches, some of them wrong: x and y in px in each picture, float64 [N, 2]."""
+    """N matches, some of which are wrong: x and y in px in each picture, float64 [N, 2]."""
 
     left_px: Float[np.ndarray, "n 2"]
     right_px: Float[np.ndarray, "n 2"]
@@ -54,7 +54,7 @@ def find_matches(
 ) -> Matches:
     """Find up to `most` matches, accurate to about 0.1 px; the pair need not be rectified.
 
-    About one match in five is wrong and must be rejected by the caller, by epipolar geometry.
+    About one match in five is wrong and must be rejected by the caller, using epipolar geometry.
     """
     greys = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (left, right)]
     found = _pair_corners(greys, most, rows_off=_MOST_ROWS_OFF * left.shape[0])
@@ -82,7 +82,7 @@ def _pair_corners(greys: list[UInt8[np.ndarray, "h w"]], most: int, rows_off: fl
 def _find_corners(
     grey: UInt8[np.ndarray, "h w"], most: int
 ) -> tuple[Float[np.ndarray, "n 2"], Float32[np.ndarray, "n k"]]:
-    """Return the corners in px of the full-size picture, and their windows."""
+    """Return the corners, in px of the full-size picture, and the windows around them."""
     factor = _downscale_factor(grey)
     height, width = grey.shape
     if factor > 1:
@@ -112,8 +112,8 @@ def _refine_matches(
 ) -> Matches:
     """Refine the right positions to a fraction of a pixel, and drop matches that do not fit.
 
-    Source: the inverse compositional algorithm (Baker and Matthews 2004) for a translation. Mean and contrast
-    of the windows are normalised, because exposures may differ.
+    Source: the inverse compositional algorithm (Baker and Matthews 2004) for a translation. The mean and
+    contrast of the windows are normalised, because exposures may differ.
     """
     if not len(found.left_px):
         return found
@@ -124,7 +124,7 @@ def _refine_matches(
         [wide[:, 1:-1, 2:] - wide[:, 1:-1, :-2], wide[:, 2:, 1:-1] - wide[:, :-2, 1:-1]], axis=1
     ).reshape(len(wide), 2, -1)
     slopes = slopes / (2 * contrast[:, None])
-    # A small ridge prevents a window on one straight edge from sliding along it.
+    # A small ridge prevents a window on a single straight edge from sliding along the edge.
     normal = slopes @ slopes.transpose(0, 2, 1) + 1e-4 * np.eye(2)
     exact, step = found.right_px.copy(), np.zeros_like(found.right_px)
     for _ in range(_EXACT_STEPS):
@@ -142,7 +142,7 @@ def _refine_matches(
 def _sample_windows(
     grey: UInt8[np.ndarray, "h w"], centres_px: Float[np.ndarray, "n 2"], radius: int, step_px: float
 ) -> Float32[np.ndarray, "n k"]:
-    """Sample grey levels around each centre, `step_px` apart; outside the picture, its border is repeated."""
+    """Sample grey levels around each centre, `step_px` apart; the border is repeated outside the picture."""
     offsets = np.arange(-radius, radius + 1) * step_px
     down, along = (offset.ravel() for offset in np.meshgrid(offsets, offsets, indexing="ij"))
     columns, rows = (
@@ -157,7 +157,7 @@ def _sample_windows(
 def _normalise(
     windows: Float32[np.ndarray, "n k"],
 ) -> tuple[Float32[np.ndarray, "n k"], Float32[np.ndarray, "n 1"]]:
-    """Normalise windows to mean 0 and length 1, or nearly 0 if plain; return them and their divisors."""
+    """Normalise windows to mean 0 and length 1, or less if they are plain; return them and their divisors."""
     centred = windows - windows.mean(1, keepdims=True)
     least = _WEAK_CONTRAST_LEVELS * math.sqrt(windows.shape[1])
     length = np.maximum(np.linalg.norm(centred, axis=1, keepdims=True), least)

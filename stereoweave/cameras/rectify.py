@@ -24,7 +24,7 @@ class Rectified:
 
     Attributes:
         pair: The pair, with masks that are False outside the source pictures, and with its camera if known.
-        notes: Notes on what rectification did.
+        notes: Notes on the rectification.
     """
 
     pair: StereoPair
@@ -32,23 +32,23 @@ class Rectified:
 
 
 def rectify(pair: StereoPair, rig: Rig) -> Rectified:
-    """Rectify a pair to two parallel pinhole cameras; the size stays the same, and the camera is added.
+    """Rectify a pair to two parallel pinhole cameras; keep the size, and add the camera.
 
     Both cameras are rotated to a common direction, between their own directions and perpendicular to the
-    baseline. The new focal length is the mean of the two, which preserves the resolution in the middle. Both
-    views share one principal point (doffs 0), chosen to keep most of each view visible. If the rig is
-    rectified already, the pictures do not change.
+    baseline. The new focal length is the mean of both focal lengths, to preserve the resolution in the
+    middle. Both views share one principal point (doffs 0), chosen to keep most of each view visible. If the
+    rig is rectified already, the pictures do not change.
 
     Raises:
-        FormatError: The rig is for pictures of another size.
+        FormatError: The rig is for pictures of a different size.
         StereoweaveError: The right camera is not to the right of the left one.
     """
     rig.check_size(pair)
     _check_side_by_side(rig)
     if rig.unlike_rectified() is None:
-        note = Note(f"{rig.name} is a calibration of rectified pictures: they are left unchanged")
+        note = Note(f"{rig.name} is a calibration of rectified pictures, so they are left unchanged")
         return Rectified(pair=replace(pair, camera=rig.camera()), notes=(*rig.notes, note))
-    # Values that cannot be computed are not finite, and are rejected later.
+    # Values that cannot be computed become NaN or infinity and are rejected later.
     with np.errstate(all="ignore"):
         turns = _find_rotations(rig)
         camera = _choose_camera(rig, turns, pair_size_px(pair))
@@ -134,7 +134,7 @@ def _choose_camera(
 
 
 def _find_direction(optics: Optics, at_px: Float[np.ndarray, "2"]) -> Float[np.ndarray, "3"]:
-    """Return the viewing direction of a pixel, x and y at depth 1."""
+    """Return the viewing direction of a pixel as x, y and z, where z is 1."""
     undistort = cv2.fisheye.undistortPoints if optics.fisheye else cv2.undistortPoints
     (x, y), *_ = undistort(at_px.reshape(1, 1, 2), optics.matrix, _pad_distortion(optics)).reshape(-1, 2)
     return np.array([x, y, 1])
@@ -145,7 +145,7 @@ def _rectify_view(
 ) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
     """Warp a picture to the rectified camera; return it with the mask of its valid pixels.
 
-    Outside the picture its border is repeated, because an edge at the border would be matched.
+    The border is repeated outside the picture, because an edge at the border would be matched.
     """
     height, width = image.shape[:2]
     pinhole = np.array([[camera.focal_px, 0, camera.cx_px], [0, camera.focal_px, camera.cy_px], [0, 0, 1]])
@@ -160,10 +160,10 @@ def _rectify_view(
 def _find_valid_field(
     optics: Optics, turn: Float[np.ndarray, "3 3"], pinhole: Float[np.ndarray, "3 3"], shape: tuple[int, int]
 ) -> Bool[np.ndarray, "h w"]:
-    """Return the mask of pixels in front of the camera, and within the radius where the lens model is valid.
+    """Return the mask of pixels in front of the camera and within the radius where the lens model is valid.
 
-    The distortion polynomial is fitted inside the picture. Outside the picture it may decrease, which would
-    show the border again, mirrored.
+    The distortion polynomial is fitted only inside the picture. Farther out it may decrease, and the parts
+    near the border would then appear again, mirrored.
     """
     rows, columns = np.indices(shape, np.float32)
     to_direction = (turn.T @ np.linalg.inv(pinhole)).astype(np.float32)
@@ -191,7 +191,7 @@ def _find_fold(optics: Optics, most: float) -> float:
 
 
 def _pad_distortion(optics: Optics) -> Float[np.ndarray, " n"]:
-    """Return the distortion as OpenCV's fisheye functions need it: with four coefficients, not none."""
+    """Return the distortion coefficients; four zeros if there are none, as OpenCV's functions require."""
     return optics.distortion if optics.distortion.size else np.zeros(4)
 
 
@@ -200,13 +200,13 @@ def _summarize(rig: Rig, turns: Sequence[Float[np.ndarray, "3 3"]], pair: Stereo
     assert pair.left_seen is not None and pair.right_seen is not None
     seen_percent = 100 * (pair.left_seen & pair.right_seen).mean()
     return Note(
-        f"rectified by {rig.name}: left picture rotated by {left:.2f} degrees, right picture by "
+        f"rectified with {rig.name}: left picture rotated by {left:.2f} degrees, right picture by "
         f"{right:.2f}; {seen_percent:.0f} % of the pixels are valid in both"
     )
 
 
 def _find_largest_rectangle(full: Bool[np.ndarray, "h w"]) -> tuple[slice, slice]:
-    """Return rows and columns of the largest full rectangle of cells, then enlarged pixel by pixel."""
+    """Return the rows and columns of the largest rectangle of full cells, enlarged pixel by pixel."""
     cell_px = max(1, min(-(-max(full.shape) // _CELLS), min(full.shape) // _LEAST_CELLS))
     top, bottom, start, stop = (
         cell_px * side for side in _find_largest_of_cells(_find_full_cells(full, cell_px))
@@ -229,15 +229,16 @@ def _find_full_cells(full: Bool[np.ndarray, "h w"], cell_px: int) -> Bool[np.nda
 
 
 def _find_largest_of_cells(full: Bool[np.ndarray, "rows columns"]) -> tuple[int, int, int, int]:
-    """Return top, bottom, start and stop of the largest full rectangle.
+    """Return the top, bottom, start and stop of the largest rectangle of full cells.
 
-    For each row, it is the largest rectangle under a histogram of full cells, found with a stack of bars.
+    For each row, a histogram counts the consecutive full cells upwards, and a stack of bars finds the largest
+    rectangle under the histogram.
     """
     best, found = 0, (0, 0, 0, 0)
     heights = np.zeros(full.shape[1], int)
     for row, cells in enumerate(full):
         heights = (heights + 1) * cells
-        standing: list[tuple[int, int]] = []  # column and height, each higher than the one before
+        standing: list[tuple[int, int]] = []  # column and height, in ascending order of height
         for column, height in enumerate([*heights.tolist(), 0]):
             start = column
             while standing and standing[-1][1] >= height:
@@ -247,6 +248,6 @@ def _find_largest_of_cells(full: Bool[np.ndarray, "rows columns"]) -> tuple[int,
             standing.append((start, height))
     if not best:
         raise StereoweaveError(
-            "expected two pictures that overlap after rectification, found no common pixel"
+            "expected two pictures that overlap after rectification, found no common pixels"
         )
     return found

@@ -38,7 +38,7 @@ class _Homographies(NamedTuple):
 
 
 def rectify_by_features(pair: StereoPair) -> Rectified:
-    """Rectify a pair from its feature matches.
+    """Rectify a pair using its feature matches.
 
     Both pictures are warped by the smallest camera rotations that suffice; the focal length is fitted too.
     Unlike arbitrary homographies, rotations preserve shapes. The result has no camera, because neither focal
@@ -62,15 +62,16 @@ def rectify_by_features(pair: StereoPair) -> Rectified:
     right, right_seen = _warp(pair.right, turns.right, pair.right_seen)
     before_px = np.abs(matches.lower_px)
     note = Note(
-        f"rectified by {len(missed_px)} matches: median vertical error {np.median(missed_px):.2f} px, before "
-        f"{np.median(before_px):.2f} px; the right picture was shifted sideways by {moved_px:+.0f} px"
+        f"rectified with {len(missed_px)} matches: median vertical error {np.median(missed_px):.2f} px "
+        f"({np.median(before_px):.2f} px before); the right picture was shifted sideways by "
+        f"{moved_px:+.0f} px"
     )
     rectified = replace(pair, left=left, right=right, camera=None, left_seen=left_seen, right_seen=right_seen)
     return Rectified(pair=rectified, notes=(note,))
 
 
 def _select_inliers(found: Matches) -> Matches:
-    """Return the matches that agree with one epipolar geometry."""
+    """Return the matches that are consistent with the same epipolar geometry."""
     count = len(found.left_px)
     right_ones = np.zeros(count, bool)
     if count >= _LEAST_MATCHES:
@@ -83,7 +84,8 @@ def _select_inliers(found: Matches) -> Matches:
     if right_ones.sum() < max(_LEAST_MATCHES, _LEAST_RIGHT_SHARE * count):
         raise StereoweaveError(
             f"expected at least {_LEAST_MATCHES} feature matches that agree on the camera positions, "
-            f"found {right_ones.sum()} of {count} matches; take pictures with more texture and more overlap",
+            f"found {right_ones.sum()} of {count} matches; "
+            "photograph a scene with more texture and with more overlap",
             setting="rectify",
             remedy=Remedy("or give a calibration", ("calibration",)),
         )
@@ -117,9 +119,10 @@ def _fit_rotations(matches: Matches, width: int, height: int) -> Float[np.ndarra
 
 
 def _make_homographies(parameters: Float[np.ndarray, " 6"], width: int, height: int) -> _Homographies:
-    """Return the homographies of rotations: left camera by yaw and roll, right camera by pitch, yaw and roll.
+    """Return the homographies of two camera rotations.
 
-    A common pitch does not change the alignment of rows, so the left camera keeps its pitch.
+    The left camera is rotated by yaw and roll, and the right camera by pitch, yaw and roll. A common pitch
+    does not change the alignment of rows, so the left camera keeps its pitch.
     """
     left_yaw, left_roll, right_pitch, right_yaw, right_roll, log_focal = parameters
     focal_px = width * np.exp(log_focal)
@@ -131,7 +134,7 @@ def _make_homographies(parameters: Float[np.ndarray, " 6"], width: int, height: 
 
 
 def _measure_sampson_px(turns: _Homographies, matches: Matches) -> Float[np.ndarray, " n"]:
-    """Return the Sampson errors: first-order distance of each match to its epipolar lines, in source px."""
+    """Return each match's Sampson error, the first-order distance to its epipolar lines, in source px."""
     across = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     fundamental = turns.right.T @ across @ turns.left
     ones = np.ones((len(matches.left_px), 1))

@@ -13,7 +13,7 @@ from stereoweave.stereo import CAMERA_NUMBERS_BELOW, StereoCamera, StereoPair
 _PINHOLE_COUNTS, _FISHEYE_COUNTS = (0, 4, 5, 8, 12, 14), (0, 4)
 # In the smallest pictures, 32 px wide, this means a field of view of 173 degrees.
 _LEAST_FOCAL_PX = 1
-# Tolerances for files with few decimals; they amount to some hundredths of a pixel in a picture of 4000 px.
+# Tolerances for files with few decimals; they amount to a few hundredths of a pixel in a 4000 px picture.
 _ROTATION_OFF, _SAME_PX, _SAME_DIRECTION = 1e-5, 1e-2, 1e-3
 _ROUNDED = 1e-3
 
@@ -25,9 +25,9 @@ class Optics:
     """Camera intrinsics: projection of a point x, y, z (right, down, forward) to a pixel.
 
     Attributes:
-        matrix: [3, 3], focal lengths and principal point in px, without skew; pixel centres are integers.
+        matrix: Focal lengths and principal point in px, [3, 3] without skew; pixel centres are integers.
         distortion: Coefficients [N] in OpenCV's order: k1 k2 p1 p2 k3 ... for a pinhole (N is 0, 4, 5, 8, 12
-            or 14), k1 k2 k3 k4 for a fisheye lens (N is 0 or 4).
+            or 14), and k1 k2 k3 k4 for a fisheye lens (N is 0 or 4).
         fisheye: Whether the lens follows Kannala and Brandt's model, which OpenCV calls fisheye and Kalibr
             `equidistant`.
     """
@@ -65,7 +65,7 @@ class Rig:
             x_right = rotation @ x_left + translation_m. In a rectified rig, translation_m[0] is minus the
             baseline.
         size_px: Picture width and height; None if the file does not state them.
-        name: Name of the rig in errors, such as its file.
+        name: Name of the rig in error messages, such as its file name.
         notes: Notes on assumptions made about the file.
     """
 
@@ -96,7 +96,7 @@ class Rig:
 
     @property
     def baseline_m(self) -> float:
-        """Distance between the two cameras."""
+        """Distance between the two cameras in metres."""
         return float(np.linalg.norm(self.translation_m))
 
     @property
@@ -115,7 +115,7 @@ class Rig:
         if np.abs(aside - (-1, 0, 0)).max() > _SAME_DIRECTION:
             return "a right camera that is not exactly to the right of the left one"
         if np.abs((left - right)[[0, 1, 1], [0, 1, 2]]).max() > _SAME_PX:
-            return "cameras with different focal lengths or different rows of the principal point"
+            return "cameras with different focal lengths or with principal points in different rows"
         return None
 
     def camera(self) -> StereoCamera:
@@ -141,7 +141,7 @@ class Rig:
         )
 
     def check_size(self, pair: StereoPair) -> None:
-        """Raise a FormatError if the rig is for pictures of another size."""
+        """Raise FormatError if the rig is for pictures of a different size."""
         size_px = pair_size_px(pair)
         if self.size_px not in (None, size_px):
             raise FormatError(
@@ -164,7 +164,9 @@ def rectified_rig(pair: StereoPair) -> Rig:
     """Return the rig of a rectified pair whose camera is known."""
     camera = pair.camera
     if camera is None:
-        raise StereoweaveError("expected a pair whose camera is known, found none; give it a calibration")
+        raise StereoweaveError(
+            "expected a pair whose camera is known, found an unknown camera; give a calibration"
+        )
     focal_px, cx_px, cy_px = camera.focal_px, camera.cx_px, camera.cy_px
     left = np.array([[focal_px, 0, cx_px], [0, focal_px, cy_px], [0, 0, 1]], np.float64)
     right = left + np.array([[0, 0, camera.doffs_px], [0, 0, 0], [0, 0, 0]])
@@ -174,9 +176,9 @@ def rectified_rig(pair: StereoPair) -> Rig:
 def make_rectified_rig(
     left: Float[np.ndarray, "3 n"], right: Float[np.ndarray, "3 n"], aside_m: float
 ) -> Rig:
-    """Return a rectified rig, given two camera or projection matrices, of which three columns are used.
+    """Return a rectified rig from the first three columns of two camera or projection matrices.
 
-    The right camera is `-aside_m` to the right of the left one.
+    The right camera is `-aside_m` metres to the right of the left one.
     """
     return Rig(
         left=Optics(matrix=left[:, :3], distortion=np.zeros(0)),

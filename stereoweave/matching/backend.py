@@ -12,10 +12,10 @@ from stereoweave.system.threads import thread_count
 
 @dataclass(frozen=True, kw_only=True)
 class Backend:
-    """A network and the settings it runs with; each process loads it once.
+    """A network and its settings; each process loads the network once.
 
     Attributes:
-        model: Name of a shipped network, `best`, or the path of an .onnx matcher file.
+        model: Name of a shipped network, the preset `best`, or the path of an .onnx matcher file.
         threads: Maximum number of threads per call; default: all cores.
         provider: Execution provider, a name in `providers.PROVIDERS`.
     """
@@ -37,12 +37,18 @@ class Backend:
             return _load(self, path, path.stat().st_mtime_ns)
 
     def check(self) -> None:
-        """Load the network without keeping it in memory; raises like `matcher`."""
+        """Check that the network can be loaded, without keeping it in memory.
+
+        Raises the same errors as `matcher`.
+        """
         self._check_settings()
         Matcher(self.model, threads=self.threads, provider=self.provider)
 
     def pin(self) -> "PinnedBackend":
-        """Load the network, and ignore later changes of its file; raises like `matcher`."""
+        """Load the network, and return a backend that ignores later changes to its file.
+
+        Raises the same errors as `matcher`.
+        """
         return PinnedBackend(
             model=self.model, threads=self.threads, provider=self.provider, pinned=self.matcher()
         )
@@ -54,7 +60,7 @@ class Backend:
 
 @dataclass(frozen=True, kw_only=True)
 class PinnedBackend(Backend):
-    """A backend that keeps the network it has loaded; see `Backend.pin`."""
+    """A backend that keeps its loaded network; see `Backend.pin`."""
 
     pinned: Matcher
 
@@ -63,11 +69,11 @@ class PinnedBackend(Backend):
         return self.pinned
 
 
-# lru_cache does not wait for a concurrent call with the same arguments: each thread would load the network.
+# Without a lock, each of several concurrent calls would load the network, because lru_cache does not wait.
 _LOADING = threading.Lock()
 
 
 @functools.lru_cache(maxsize=4)
 def _load(backend: Backend, path: Path, modified_ns: int) -> Matcher:
-    # path and modified_ns are part of the cache key only: a relative path may now name another file.
+    # path and modified_ns only distinguish cache entries: a relative path may later name another file.
     return Matcher(backend.model, threads=backend.threads, provider=backend.provider)

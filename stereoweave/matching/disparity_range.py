@@ -1,7 +1,7 @@
 """Detection of a pair's disparity range from sparse matches, with no limit on the disparity.
 
-High-contrast pixels in sampled rows of the downsampled left image are searched for along the entire row of
-the right image.
+Each high-contrast pixel in sampled rows of the downsampled left image is searched for along the entire
+corresponding row of the right image.
 """
 
 from typing import NamedTuple
@@ -24,15 +24,15 @@ _LEAST_CONTRAST_LEVELS = 3.0
 _LEAST_LIKENESS = 0.8
 _MOST_AMBIGUOUS = 0.7
 _PEAK_PX = 2
-# A match counts if its cell of a grid over column, row and disparity and the adjacent cells contain at least
-# this many matches.
+# A match counts if its cell in a grid of column, row and disparity, together with the adjacent cells,
+# contains at least this many matches.
 _SUPPORT = 4
 _CELL_PX = (32, 32, 3)
 _LEAST_MATCHES = 30
 _ENDS_PERCENT = 0.5
 # Margin for nearer surfaces without matches: a share of the range, plus pixels of the downsampled pair.
 _MARGIN_SHARE, _MARGIN_PX = 0.06, 2.0
-# A region exceeds a range if at least this number and this share of its matches do.
+# A region exceeds a range if at least this number and at least this share of its matches lie outside.
 _LEAST_BEYOND, _LEAST_SHARE_BEYOND = 6, 0.1
 _SLACK_PX = 0.6
 
@@ -42,7 +42,7 @@ class _Texture(NamedTuple):
 
     Attributes:
         windows: Grey levels minus their local mean, in windows [first row, centre column, rows, columns].
-        scale: Factor that normalises the window around a pixel to length 1; 0 excludes plain windows.
+        scale: Factor that normalises the window around each pixel to length 1; 0 for plain windows.
     """
 
     windows: Float32[np.ndarray, "h2 w r c"]
@@ -50,11 +50,11 @@ class _Texture(NamedTuple):
 
 
 def find_range(pair: StereoPair) -> tuple[float, float] | None:
-    """Return the least and greatest disparity of the left view in px; either may be negative.
+    """Return the least and the greatest disparity of the left view in px; either may be negative.
 
     The greatest disparity includes a margin for nearer surfaces without matches. The least disparity has no
-    margin, because a network assigns a plain sky the lower end of its range: with a least disparity 5 px too
-    low, a rendered ship has twice as many wrong pixels.
+    margin, because a network assigns the lower end of its range to a plain sky. If the least disparity is
+    5 px too low, a rendered ship has twice as many wrong pixels.
 
     Pixels without content are ignored. Returns None if there are too few matches, as in plain images or
     images of different scenes.
@@ -68,7 +68,7 @@ def find_range(pair: StereoPair) -> tuple[float, float] | None:
 
 
 def goes_beyond(pair: StereoPair, where: Bool[np.ndarray, "h w"], range_px: tuple[float, float]) -> bool:
-    """Return whether the region `where` of the left image contains disparities outside a range."""
+    """Return whether the region `where` of the left image contains disparities outside `range_px`."""
     slack_px = _SLACK_PX * _scale(pair.left)
     disparity_px = _find_disparities(pair, where)
     beyond = (disparity_px < range_px[0] - slack_px) | (disparity_px > range_px[1] + slack_px)
@@ -107,7 +107,10 @@ def _small_mask(
 def _find_inner(
     seen: Bool[np.ndarray, "h w"] | None, small: Float32[np.ndarray, "h2 w2"]
 ) -> Bool[np.ndarray, "h2 w2"]:
-    """Return the mask of pixels whose entire window has content: the content's border is not texture."""
+    """Return the mask of pixels whose entire window has content.
+
+    Other windows contain the border of the content, which is not texture.
+    """
     if seen is None:
         return np.ones(small.shape, bool)
     window = np.ones((_WINDOW_ROWS + 2, _WINDOW_COLUMNS + 2), np.uint8)
@@ -120,7 +123,7 @@ def _match_rows(
     wanted: Bool[np.ndarray, "h w"],
     seen: Bool[np.ndarray, "h w"],
 ) -> Float[np.ndarray, "n 3"]:
-    """Return column, row and disparity in px of the unambiguous matches that agree in both directions.
+    """Return the column, row and disparity in px of each match that is unambiguous in both directions.
 
     Args:
         left: Left image, grey levels.
@@ -146,7 +149,7 @@ def _peaks(
 ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
     """Return each row's best column, the subpixel offset of its peak, and whether the peak is unambiguous.
 
-    The values of `likeness` near the peaks are overwritten.
+    Overwrites the values of `likeness` near the peaks.
     """
     width = likeness.shape[1]
     each, best = np.arange(len(likeness)), likeness.argmax(1)
@@ -162,7 +165,7 @@ def _peaks(
 def _find_salient(
     grey: Float32[np.ndarray, "h w"], rows: Int[np.ndarray, " r"], wanted: Bool[np.ndarray, "h w"]
 ) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
-    """Return rows and columns of the highest gradient in every _SPACING_PX columns, limited to the mask."""
+    """Return the rows and columns of the highest gradient in every _SPACING_PX columns, within `wanted`."""
     steps = np.abs(cv2.Sobel(grey, cv2.CV_32F, 1, 0))[rows]
     count = grey.shape[1] // _SPACING_PX
     cells = steps[:, : count * _SPACING_PX].reshape(len(rows), count, _SPACING_PX)
@@ -188,15 +191,15 @@ def _texture(grey: Float32[np.ndarray, "h w"]) -> _Texture:
 def _likeness(
     own: _Texture, rows: Int[np.ndarray, " n"], columns: Int[np.ndarray, " n"], other: _Texture
 ) -> Float32[np.ndarray, "n w"]:
-    """Return the correlation of the window around each pixel with every window in the other image's row."""
+    """Return the correlation of each pixel's window with every window in the same row of the other image."""
     width, pixels = other.scale.shape[1], _WINDOW_ROWS * _WINDOW_COLUMNS
     likeness = np.empty((len(rows), width), np.float32)
-    # Row by row: a row's windows, a matrix [77, W], stay in the CPU cache.
+    # Works row by row, because the windows of one row, a matrix [77, W], fit in the CPU cache.
     for row in np.unique(rows):
         here, first = rows == row, row - _WINDOW_ROWS // 2
         within = own.windows[first, columns[here]].reshape(-1, pixels)
         along = other.windows[first].transpose(1, 2, 0).reshape(pixels, width)
-        # einsum, because NumPy's matrix product would use all cores regardless of the caller's limit.
+        # Uses einsum, because NumPy's matrix product would use all cores regardless of the caller's limit.
         likeness[here] = np.einsum("nk,kw->nw", within, along)
     return likeness * own.scale[rows, columns, None] * other.scale[rows]
 

@@ -1,4 +1,4 @@
-"""`stereoweave.estimate`: matching of pairs of any size and disparity range.
+"""Matching of pairs of any size and disparity range: `stereoweave.estimate`.
 
 A network covers disparities from 0 to its maximum, in images up to a certain size. For other disparities, the
 right image is shifted along its rows. For wider ranges and larger images, both images are scaled down, and
@@ -31,31 +31,31 @@ from stereoweave.matching.refine import right_confidence
 from stereoweave.matching.upsample import enlarge
 from stereoweave.stereo import LONGEST_SIDE_PX, Estimate, StereoPair
 
-# Where the true disparity is beyond its range, a network often predicts the end of the range, with a
-# confidence between these two.
+# Where the true disparity is outside a network's range, the network often predicts the end of the range, with
+# a confidence between these two values.
 _CONFIDENT, _CONFIDENT_AT_END = 0.5, 0.9
-# The disparity range is searched if at least this percentage of the pixels is doubtful.
+# The disparity range is searched if at least this percentage of pixels is doubtful.
 _DOUBTFUL_PERCENT = 1.0
 # A network is less accurate near the ends of its range.
 _MARGIN_PX = 4
-# Disparities more than this outside a given range are wrong, not just rounded.
+# Disparities that are outside a given range by more than this are wrong, not just rounded.
 _OUTSIDE_PX = 1
-# Usable share of PIXEL_PAIRS_AT_ONCE, because the number of rows is rounded to a multiple.
+# Only this share of PIXEL_PAIRS_AT_ONCE is usable, because the number of rows is rounded to a multiple.
 _FILLED = 0.95
 # Greatest combined rounding error of width and shift.
 _ROUNDED_PX = 2
-# Below this magnification, a second, magnified run is not worth its time. Its disparity range is measured on
-# a grid of pixels with this spacing, ignoring this percentage at both ends.
+# Below this magnification, a second, magnified run is not worthwhile. The disparity range of the magnified
+# run is measured on a grid of pixels with this spacing, ignoring this percentage at each end.
 _LEAST_MAGNIFICATION = 1.1
 _ENDS_PERCENT, _STEP_PX = 0.5, 4
 # Disparities of the magnified pair that differ by more than this belong to different surfaces.
 _OTHER_SURFACE_PX = 3.0
-# Median window applied to a magnified estimate before it is sampled at the pair's size.
+# Size of the median filter applied to a magnified estimate before sampling it at the pair's size.
 _MEDIAN_PX = 3
 
 
 class _NetworkInput(NamedTuple):
-    """Network input for a pair: the scaled pair, and the shift of its right image in px (None: no shift)."""
+    """Network input for a pair: the scaled pair, and the shift of the right image in px, if any."""
 
     small: StereoPair
     least_px: int | None = None
@@ -72,14 +72,15 @@ def estimate(  # noqa: PLR0913 - all but the images are keyword-only and optiona
     raw: bool = False,
     range_px: tuple[float, float] | None = None,
 ) -> Estimate:
-    """Estimate the disparity of both views, confidence and occlusion of a rectified pair.
+    """Estimate both views' disparities, the confidence and the occlusion mask of a rectified pair.
 
     Args:
-        left: Left image, at least 32x32: uint8 RGB [H, W, 3], or another type that `arrays.as_rgb` accepts,
-            such as a PIL image or a PyTorch tensor.
+        left: Left image of at least 32x32 px, as uint8 RGB [H, W, 3] or any other type that `arrays.as_rgb`
+            accepts, such as a PIL image or a PyTorch tensor.
         right: Right image of the same size.
-        model: Name of a shipped network; `best`, which runs network base a second time at 1.5 times the size
-            and refines its answer; or the path of an .onnx matcher file. Loaded on the first call and cached.
+        model: Name of a shipped network, `best`, or the path of an .onnx matcher file. `best` runs the
+            network `base`, runs it again at up to 1.5 times the size, and refines the result. The network is
+            loaded on the first call and cached.
         threads: Maximum number of threads; default: all cores.
         provider: Execution provider: cpu, cuda, tensorrt, openvino, coreml or directml.
         refined: See `MatchOptions`.
@@ -88,7 +89,7 @@ def estimate(  # noqa: PLR0913 - all but the images are keyword-only and optiona
 
     Raises:
         ValueError: MatcherError for an unknown model or an unavailable provider, ProviderError for a provider
-            that fails, StereoweaveError for invalid images or options.
+            that fails, and StereoweaveError for invalid images or options.
     """
     options = MatchOptions(range_px=range_px, refined=refined, raw=raw)
     pair = StereoPair(left=as_rgb(left, "left"), right=as_rgb(right, "right"))
@@ -97,12 +98,14 @@ def estimate(  # noqa: PLR0913 - all but the images are keyword-only and optiona
 
 
 def match(matcher: Matcher, pair: StereoPair, options: MatchOptions = DEFAULT_OPTIONS) -> Estimate:
-    """Match a pair of any size; if one run of the network suffices, the result equals `matcher.estimate`.
+    """Match a pair of any size.
+
+    If one run of the network suffices, the result is the same as from `matcher.estimate`.
 
     Args:
         matcher: The network.
-        pair: The rectified pair. Left pixels without content get confidence 0; pixels whose match has no
-            content in the right image are marked occluded.
+        pair: The rectified pair. Left pixels without content get confidence 0, and pixels whose match has no
+            content in the right image are marked as occluded.
         options: Matching options; `refined` and `raw` apply at the network's input size. The disparities of
             larger pairs are upsampled even if `raw` is set.
 
@@ -116,7 +119,7 @@ def match(matcher: Matcher, pair: StereoPair, options: MatchOptions = DEFAULT_OP
 def match_many(
     matcher: Matcher, pairs: Sequence[StereoPair], options: MatchOptions = DEFAULT_OPTIONS
 ) -> list[Estimate]:
-    """Match pairs of any sizes as `match` does, in batches of pairs with the same network input size."""
+    """Match pairs of any size as `match` does, in batches of pairs with the same network input size."""
     every_shown = [_prepare_first_input(matcher, pair, options.range_px) for pair in pairs]
     moved = [_shift(shown) for shown in every_shown]
     of_size: dict[tuple[int, ...], list[int]] = {}
@@ -146,7 +149,7 @@ def _clip_to_width(range_px: tuple[float, float], width_px: int) -> tuple[float,
 def _prepare_first_input(
     matcher: Matcher, pair: StereoPair, range_px: tuple[float, float] | None
 ) -> _NetworkInput:
-    """Return the input of the network's first run, which covers the given range or the network's own."""
+    """Return the network's first input, prepared for the given range (None: the network's own range)."""
     seen = _fit_network(matcher, pair)
     if range_px is None:
         return _NetworkInput(seen)
@@ -158,7 +161,7 @@ def _prepare_first_input(
 def _finish(
     matcher: Matcher, pair: StereoPair, shown: _NetworkInput, found: Estimate, options: MatchOptions
 ) -> Estimate:
-    """Return the pair's estimate, given the output of the network's first run; run it again if needed."""
+    """Return the pair's estimate, given the output of the first run; run the network again if needed."""
     found = _undo_shift(shown, found)
     if options.range_px is None:
         beyond_px = _find_wider_range(shown.small, found, matcher.max_disparity_px)
@@ -181,7 +184,7 @@ def _finish(
 
 
 def _fit_network(matcher: Matcher, pair: StereoPair) -> StereoPair:
-    """Scale the pair to a size that one network run can take: strips would leave visible seams."""
+    """Scale the pair to a size that one run of the network can take, because strips would leave seams."""
     height, width = pair.left.shape[:2]
     return _resize(pair, _find_downscale(matcher, width, height))
 
@@ -191,8 +194,8 @@ def _find_downscale(
 ) -> float:
     """Return the factor by which to scale down an image of this size so that one network run suffices.
 
-    A factor below 1 magnifies: it is 1 / largest if the network can take an image `largest` times as large.
-    A shift of moved_px makes the image wider by that much.
+    A factor below 1 magnifies the image. The factor is 1 / largest if the network can take an image `largest`
+    times as large. A shift of moved_px makes the image wider by moved_px.
     """
     width += moved_px
     if matcher.sees_whole(round(width * largest), round(height * largest)):
@@ -222,10 +225,10 @@ def _resize(pair: StereoPair, scale: float) -> StereoPair:
 def _match_magnified(
     matcher: Matcher, pair: StereoPair, small: StereoPair, found: Estimate
 ) -> tuple[StereoPair, Estimate]:
-    """Run the network again on the pair magnified by up to `matcher.magnification`; merge both estimates.
+    """Run the network on the pair magnified by up to `matcher.magnification`, and merge both estimates.
 
     The disparity range or memory may limit the magnification. Where the two estimates differ, the first one
-    is kept if it is more confident, which it is beyond the network's range and on textureless surfaces.
+    is kept if it is more confident, as happens beyond the network's range and on textureless surfaces.
 
     Args:
         matcher: The matcher, with a magnification above 1.
@@ -248,7 +251,7 @@ def _match_magnified(
 
 
 def _merge(closer: Estimate, found: Estimate) -> Estimate:
-    """Merge two estimates: `closer`, except where `found` has another surface with higher confidence."""
+    """Return `closer`, except where `found` has a different surface with higher confidence."""
     size = closer.disparity_px.shape[::-1]
     scale = np.float32(size[0] / found.disparity_px.shape[1])
     found_px, right_found_px, confidence, right_trust = (
@@ -328,7 +331,7 @@ def _prepare_for_range(
 ) -> _NetworkInput:
     """Scale and shift a pair so that the network covers a disparity range.
 
-    `seen` is the pair scaled so that the network takes it in one run; `range_px` is in pixels of `seen`.
+    `seen` is the pair at a size that one run of the network can take; `range_px` is in pixels of `seen`.
     """
     low_px, high_px = range_px
     most_px = matcher.max_disparity_px
@@ -338,7 +341,7 @@ def _prepare_for_range(
     small = seen
     if scale > 1:
         small = _resize(pair, scale * pair.left.shape[1] / seen.left.shape[1])
-    # Shift by exactly the least disparity: a network assigns a plain sky the lower end of its range.
+    # Shift by exactly the least disparity, because a network assigns the end of its range to a plain sky.
     least_px = math.floor(low_px * small.left.shape[1] / seen.left.shape[1])
     height, width = small.left.shape[:2]
     smaller = _find_downscale(matcher, width, height, abs(least_px))
@@ -349,7 +352,7 @@ def _prepare_for_range(
 
 
 def _shift(shown: _NetworkInput) -> StereoPair:
-    """Return the pair that the network receives: the right image is shifted by padding both images."""
+    """Return the pair that the network receives, with the right image shifted by padding both images."""
     if shown.least_px is None:
         return shown.small
     (left_at, right_at), more = _start_columns(shown.least_px), abs(shown.least_px)
@@ -385,7 +388,7 @@ def _pad_columns(image: np.ndarray, before: int, behind: int) -> np.ndarray:
 
 
 def _clip(found: Estimate, low_px: float, high_px: float) -> Estimate:
-    """Clip disparities to a range; pixels more than _OUTSIDE_PX outside get confidence 0."""
+    """Clip disparities to a range; pixels outside it by more than _OUTSIDE_PX get confidence 0."""
     outside_px = np.maximum(low_px - found.disparity_px, found.disparity_px - high_px)
     return replace(
         found,
@@ -396,7 +399,7 @@ def _clip(found: Estimate, low_px: float, high_px: float) -> Estimate:
 
 
 def _apply_masks(found: Estimate, pair: StereoPair) -> Estimate:
-    """Apply the content masks: zero confidence without left content, occlusion without right content."""
+    """Apply the content masks to the confidence and the occlusion mask, as described in `match`."""
     confidence, occluded = found.confidence, found.occluded
     if pair.left_seen is not None:
         confidence = np.where(pair.left_seen, confidence, np.float32(0))

@@ -1,7 +1,7 @@
 """Equalisation of exposure and colour between the two images of a pair.
 
-The correspondence between the levels of both images is fitted to matched pixels, channel by channel. Images
-that differ only by noise are left unchanged.
+The correspondence between the levels of the two images is fitted to matched pixels, channel by channel.
+Images that differ only by noise are left unchanged.
 """
 
 from dataclasses import dataclass
@@ -13,17 +13,18 @@ from jaxtyping import Bool, Float, Float32, Shaped, UInt8
 
 from stereoweave.stereo import Estimate
 
-# Both images are downsampled to about this many pixels, which are enough to fit a curve and average out
+# Both images are downsampled to about this many pixels, which is enough to fit a curve and to average out
 # noise.
 _PIXELS = 20_000
 _LEAST_CONFIDENCE = 0.5
-# Small matching errors do not matter where neighbours in the downsampled images differ by at most this.
+# Small matching errors do not matter where neighbours in the downsampled images differ by at most this
+# disparity and at most this many grey levels.
 _CALM_PX = 1.0
 _CALM_LEVELS = 32
 # A level this close to 0 or 255 may be clipped.
 _END_LEVELS = 4
-# This many pixels with no difference are added at each end: black stays black and white stays white unless
-# there is evidence to the contrary.
+# This many pixels without a difference are added at each end, so black stays black and white stays white
+# unless there is evidence to the contrary.
 _END_PRIOR = 3
 # A match is an outlier if its level difference deviates from the median of its bin by more than this many
 # median deviations and by more than this many levels.
@@ -71,12 +72,12 @@ class _Channel(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Looks:
-    """Correspondence between the levels of two images of one scene, channel by channel.
+    """Correspondence between the levels of two images of the same scene, channel by channel.
 
     Attributes:
-        right_of_left: float32 [256, 3], 0..255 and non-decreasing: the right image's level for each level of
-            the left one.
-        left_of_right: The left image's level for each level of the right one.
+        right_of_left: Right image's level for each level of the left image; float32 [256, 3] in 0..255,
+            non-decreasing.
+        left_of_right: Left image's level for each level of the right image, in the same form.
     """
 
     right_of_left: Float32[np.ndarray, "256 3"]
@@ -86,8 +87,8 @@ class Looks:
         """Return lookup tables [256, 3] that give the left and the right image the same exposure and colour.
 
         Args:
-            position: 0 for the left image's look, for which the left table is the identity; 1 for the right
-                image's look. Values in between interpolate linearly; values outside 0..1 are clamped.
+            position: 0 for the look of the left image, whose table is then the identity, and 1 for the look
+                of the right image. Values in between interpolate linearly; values outside 0..1 are clamped.
         """
         share = np.float32(np.clip(position, 0, 1))
         return (
@@ -106,7 +107,7 @@ def recolour(
 def match_exposure(
     left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"], estimate: Estimate
 ) -> Looks | None:
-    """Fit the level correspondence of two images; return None if they agree or too few pixels match.
+    """Fit the correspondence of levels; return None if the images agree or too few pixels match.
 
     Smooth curves equalise the histograms of reliably matched pixels, because small disparity errors swap
     neighbouring pixels but hardly change histograms. The correction fades out as the mean difference
@@ -182,9 +183,9 @@ def _range(values: Shaped[np.ndarray, "h w"]) -> Shaped[np.ndarray, "h w"]:
 
 
 def _difference(channel: _Channel) -> Float[np.ndarray, " 511"]:
-    """Return right level minus left level as a function of their mean, which treats both images alike.
+    """Return the right level minus the left level as a function of their mean.
 
-    The difference fades to 0 if there are too few pixels.
+    Using the mean treats both images alike. The difference fades to 0 if there are too few pixels.
     """
     kept = ~channel.cut_off
     known = _ramp(int(kept.sum()), *_MATCHES)
@@ -199,7 +200,7 @@ def _difference(channel: _Channel) -> Float[np.ndarray, " 511"]:
 def _measure_deviation(
     left: UInt8[np.ndarray, " n"], right: UInt8[np.ndarray, " n"]
 ) -> Float[np.ndarray, " n"]:
-    """Return the deviation of each level difference from the median difference of its bin of left levels."""
+    """Return the deviation of each level difference from the median difference in its bin of left levels."""
     differences = right.astype(int) - left
     bins = left // _BIN_LEVELS
     medians = [
@@ -215,12 +216,12 @@ def _fit_curve(left: UInt8[np.ndarray, " n"], right: UInt8[np.ndarray, " n"]) ->
     curve is linear between knots with a penalty on bends (Eilers and Marx 1996, P-splines) and extrapolates
     linearly. It keeps both levels in 0..255.
     """
-    # NumPy's stable sort of bytes is a counting sort, 40 times as fast as its default.
+    # NumPy's stable sort of bytes is a counting sort, 40 times as fast as its default sort.
     left, right = (np.sort(side, kind="stable").astype(int) for side in (left, right))
     weights = np.bincount(left + right, minlength=511) / len(left)
     sums = np.bincount(left + right, right - left, minlength=511) / len(left)
-    # Uses no NumPy matrix product or solver: the BLAS threads would keep spinning afterwards, on cores that
-    # the renderer needs.
+    # Uses no NumPy matrix product or solver, because their BLAS threads would keep spinning afterwards, on
+    # cores that the renderer needs.
     weighted = weights[:, None] * _HATS
     beside = np.diag((weighted[:, 1:] * _HATS[:, :-1]).sum(0), 1)
     normal = np.diag((weighted * _HATS).sum(0)) + beside + beside.T + _PRICES
@@ -231,7 +232,7 @@ def _fit_curve(left: UInt8[np.ndarray, " n"], right: UInt8[np.ndarray, " n"]) ->
 
 
 def _mean_size(difference: Float[np.ndarray, " 511"], channel: _Channel) -> float:
-    """Return the mean absolute difference over the matched pixels; 0 if there are no such pixels."""
+    """Return the mean absolute difference over the matched pixels; 0 if there are none."""
     means = channel.left.astype(int) + channel.right
     return float(np.abs(difference[means]).sum()) / max(len(means), 1)
 
@@ -256,10 +257,10 @@ def _table(difference: Float[np.ndarray, " 511"]) -> Float[np.ndarray, " 256"]:
 def _replace_ends(
     table: Float[np.ndarray, " 256"], channel: _Channel, strength: float
 ) -> Float[np.ndarray, " 256"]:
-    """Replace both ends of the table: clipped levels map to the mean level of their matches.
+    """Replace both ends of the table so that clipped levels map to the mean level of their matches.
 
-    The curve cannot represent clipping, where many levels of one image correspond to one level of the other.
-    The table is linear between the last level that is certainly not clipped and the end.
+    The curve cannot represent clipping, where many levels of one image correspond to a single level of the
+    other. The table is linear between the last level that is certainly not clipped and the end.
     """
     differences = channel.right.astype(int) - channel.left
 

@@ -1,12 +1,12 @@
-"""Left-right check: comparison of the disparities of both views."""
+"""Left-right check: comparison of the two views' disparities."""
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
 OCCLUSION_STEP_PX = 1.0
-"""A pixel is occluded if the surface at its match is nearer by more than this; less is matching error."""
-# Number of rows checked at once: checking all 50 megapixels of an image at once would take another gigabyte.
+"""Tolerance for matching errors: a pixel is occluded if the surface at its match is nearer by more."""
+# Number of rows checked at once, because checking all of a 50-megapixel image would take another gigabyte.
 _BAND_ROWS = 256
 
 
@@ -24,7 +24,7 @@ def find_occluded(
 def measure_disagreement(
     disparity_px: Float[np.ndarray, "h w"], right_disparity_px: Float[np.ndarray, "h w"]
 ) -> tuple[Float[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """Return the views' disagreement at each left pixel in px, and the mask of matches inside the image.
+    """Return the views' disagreement in px at each left pixel, and the mask of matches in the right image.
 
     The disagreement is the right disparity at the pixel's match minus the pixel's own disparity.
     """
@@ -44,7 +44,7 @@ def at_match(
 ) -> tuple[Shaped[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
     """Return the other view's value at each pixel's match, and the mask of matches inside the other image.
 
-    Matches outside take the value of the border column.
+    Matches outside the other image get the value of its border column.
 
     Args:
         values: Values of the other view, float32 or uint8.

@@ -1,7 +1,7 @@
-"""Matching with a shipped network or any matcher file under ONNX Runtime.
+"""Matching with a shipped network or any matcher file, using ONNX Runtime.
 
-A matcher file (docs/architecture.md) has inputs `left` and `right`, float32 [B, 3, H, W] in 0..1, output
-`disparity_px`, and optional outputs `right_disparity_px` and `confidence_logit`.
+A matcher file (docs/architecture.md) has the inputs `left` and `right`, float32 [B, 3, H, W] in 0..1, the
+output `disparity_px`, and the optional outputs `right_disparity_px` and `confidence_logit`.
 """
 
 import math
@@ -28,23 +28,23 @@ from stereoweave.system.threads import thread_count
 
 _FLOAT32 = "tensor(float)"
 PIXEL_PAIRS_AT_ONCE = 1920 * 1920 * 1088
-"""Greatest number of pixel pairs within rows that one run compares, which takes about 1 GB."""
-# Memory is released after larger runs, because upsampling their disparities needs as much.
+"""Greatest number of pairs of pixels in the same row that one run compares; this takes about 1 GB."""
+# Memory is released after larger runs, because the upsampling that follows needs the same amount.
 _KEPT_PIXEL_PAIRS = 1280 * 1280 * 960
 # Overlap of strips on each side. About 1 % of the pixels then differ by more than 1 px from a run on the
 # whole image.
 _STRIP_OVERLAP_PX = 64
-# Upper limit of the number to whose multiple a matcher file may have images padded.
+# Greatest `multiple_of` that a matcher file may state: the sides of images are padded to a multiple of it.
 _MOST_MULTIPLE_OF = 1024
-# A square window is plain if its means over 9x9 px vary by no more than this, the variation caused by noise
-# of 3 grey levels alone. In collages, 1 pixel in 5,000 is plain, and 1 in 3 of these has the right disparity.
+# A square window is plain if its means over 9x9 px vary by no more than this, as they do with noise of 3 grey
+# levels alone. In collages, 1 pixel in 5,000 is plain, and a third of these have the right disparity.
 _PLAIN_WINDOW_PX = 65
 _PLAIN_MEAN_PX = 9
 _PLAIN_GREY_LEVELS = 2
 
 
 class Mode(NamedTuple):
-    """A named preset, used like the name of a network.
+    """A named preset, which can be used in place of a network's name.
 
     Attributes:
         network: Name of the shipped network.
@@ -58,7 +58,7 @@ class Mode(NamedTuple):
 
 
 MODES = {"best": Mode(network="base", magnification=1.5, refined=True)}
-"""Presets by name. `best` is for stills: better thin structures and edges, but several times slower."""
+"""Presets by name. `best` is for stills: it improves thin structures and edges but is much slower."""
 
 
 class Maps(NamedTuple):
@@ -79,7 +79,7 @@ class Matcher:
         provider: Execution provider, a name in `providers.PROVIDERS`.
 
     Attributes:
-        model: The name or path given.
+        model: Name or path of the network, as given.
         fixed_size: Height and width of a network with a fixed input size; None if it accepts any size.
         magnification: Greatest factor by which `match` magnifies pairs for the network; `estimate` ignores
             it.
@@ -103,7 +103,9 @@ class Matcher:
             # Free dimensions have names instead of numbers, and a file may omit the shape altogether.
             shape: list[Any] = [*self._session.get_inputs()[0].shape, *["any"] * 4]
         except UnicodeDecodeError as error:
-            raise MatcherError(f"{self._path}: expected metadata in UTF-8, found {error}") from error
+            raise MatcherError(
+                f"{self._path}: expected metadata in UTF-8, found bytes in another encoding"
+            ) from error
         batch, _, height, width = shape[:4]
         self._takes_batches = not isinstance(batch, int) and PROVIDERS[provider].batches
         is_fixed = isinstance(height, int) and isinstance(width, int)
@@ -117,7 +119,7 @@ class Matcher:
         refined: bool = False,
         raw: bool = False,
     ) -> Estimate:
-        """Estimate the disparity of both views, confidence and occlusion of a rectified pair.
+        """Estimate both views' disparities, the confidence and the occlusion mask of a rectified pair.
 
         The left view's disparity is refined to a fraction of a pixel (`subpixel.to_subpixel`). Occluded
         pixels are filled with the disparity of the background (`occlusion_fill.fill_occluded`).
@@ -164,8 +166,8 @@ class Matcher:
     def finish(self, pair: StereoPair, found: Estimate, *, refined: bool = False) -> Estimate:
         """Post-process the network's estimate: refine it to subpixel accuracy and fill occluded pixels.
 
-        If `refined` is set, or by the matcher's preset, `refine.refine` matches the pair once more in
-        between.
+        If `refined` or the matcher's preset requests it, `refine.refine` matches the pair once more between
+        these two steps.
         """
         found = to_subpixel(pair.left, pair.right, found, self.threads)
         if refined or self._refines:
@@ -180,7 +182,8 @@ class Matcher:
         if len(sizes) > 1:
             found = ", ".join(f"{width}x{height}" for height, width in sizes)
             raise StereoweaveError(
-                f"pairs: expected pairs of equal size, got {found}; matching.match_many takes any sizes"
+                f"pairs: expected pairs of equal size, got {found}; "
+                "matching.match_many accepts pairs of different sizes"
             )
         for height, width in sizes:
             got = f"got {width}x{height}"
@@ -239,7 +242,7 @@ class Matcher:
         return maps
 
     def _run_batch(self, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[Maps]:
-        """Run the network once on a batch of (left, right) images of equal size."""
+        """Run the network once on a batch of left and right images of equal size."""
         height, width = pairs[0][0].shape[:2]
         (above, _), (before, _) = self._borders_px(height, width)
         inputs = {"left": self._tensor([x for x, _ in pairs]), "right": self._tensor([x for _, x in pairs])}
@@ -265,10 +268,10 @@ class Matcher:
                     f"{self._path}: expected {name} of shape {expected}, found {list(value.shape)}"
                 )
             if not np.isfinite(value).all():
-                raise MatcherError(f"{self._path}: expected finite values of {name}, found NaN or infinity")
+                raise MatcherError(f"{self._path}: expected finite values in {name}, found NaN or infinity")
 
     def _run_options(self, pixel_pairs: int) -> Any:
-        """Return options that keep the memory arena for the next run but release a very large one."""
+        """Return options that keep the memory arena for the next run but release it after very large runs."""
         import onnxruntime  # type: ignore[import-untyped]
 
         options = onnxruntime.RunOptions()
@@ -285,23 +288,23 @@ class Matcher:
     def _borders_px(self, height: int, width: int) -> list[tuple[int, int]]:
         """Return the padding (above, below) and (left, right) up to the network's input size.
 
-        Each side gets half of it: padding at one border only would harm one view more than the other.
+        Opposite sides get half each, because padding one side only would harm one view more than the other.
         """
         rows, columns = self._run_size(height, width)
         return [(px // 2, px - px // 2) for px in (rows - height, columns - width)]
 
     def _tensor(self, images: Sequence[UInt8[np.ndarray, "h w 3"]]) -> Float[np.ndarray, "b 3 h2 w2"]:
-        """Convert images to the network's input; repeat their border pixels as padding."""
+        """Convert images to the network's input, padded by repeating their border pixels."""
         (above, below), (before, behind) = self._borders_px(*images[0].shape[:2])
         padded = [
             cv2.copyMakeBorder(image, above, below, before, behind, cv2.BORDER_REPLICATE) for image in images
         ]
-        # Gives the result of cv2.dnn.blobFromImage in half the time.
+        # Gives the same result as cv2.dnn.blobFromImage in half the time.
         planes = np.stack([plane for image in padded for plane in cv2.split(image)])
         return planes.reshape(len(images), 3, *padded[0].shape[:2]) * np.float32(1 / 255)
 
     def _read_outputs(self) -> list[str]:
-        """Validate the graph's inputs and outputs; return the names of the outputs in `Maps`."""
+        """Validate the graph's inputs and outputs; return the names of the outputs listed in `Maps`."""
         inputs = {value.name: value.type for value in self._session.get_inputs()}
         outputs = {value.name: value.type for value in self._session.get_outputs()}
         used = [name for name in Maps._fields if name in outputs]
@@ -327,12 +330,13 @@ class Matcher:
         except ValueError:
             found = f"multiple_of {multiple_of!r}, max_disparity_px {max_disparity_px!r}"
         raise MatcherError(
-            f"{self._path}: expected the metadata of a matcher, found {found}; `stereoweave export` writes it"
+            f"{self._path}: expected a matcher's metadata, found {found}; "
+            "create the file with `stereoweave export`"
         )
 
 
 def shipped_models() -> list[str]:
-    """Return the names of the networks in the package, sorted."""
+    """Return the names of the shipped networks in alphabetical order."""
     return sorted(Path(file.name).stem for file in _weights_folder().iterdir() if file.name.endswith(".onnx"))
 
 
@@ -345,7 +349,7 @@ def _weights_folder() -> Path:
 
 
 def model_file(model: str | Path) -> Path:
-    """Return the .onnx file of a shipped network, a preset or a path.
+    """Return the path of the .onnx file for the name of a network or preset, or for a path.
 
     Raises:
         MatcherError: The model is unknown or its file does not exist.
@@ -359,14 +363,14 @@ def model_file(model: str | Path) -> Path:
     name = MODES[str(model)].network if str(model) in MODES else str(model)
     if name not in shipped_models():
         raise MatcherError(
-            f"unknown model {name!r}; expected {' or '.join(shipped_models())}, {' or '.join(MODES)}, "
-            "or the path of an .onnx file"
+            f"unknown model {name!r}; expected {', '.join(shipped_models())}, {', '.join(MODES)} or "
+            "the path of an .onnx file"
         )
     return _weights_folder() / f"{name}.onnx"
 
 
 def _strips(height: int, rows: int) -> Iterator[slice]:
-    """Yield overlapping ranges of at most `rows` rows that cover `height`; lengths differ by at most one."""
+    """Yield overlapping ranges of at most `rows` rows that cover `height`, with nearly equal lengths."""
     if height <= rows:
         yield slice(0, height)
         return
@@ -377,7 +381,7 @@ def _strips(height: int, rows: int) -> Iterator[slice]:
 
 
 def _strip_weights(rows: slice, height: int) -> Float[np.ndarray, "h 1"]:
-    """Return the blending weight of each row of a strip, lower towards ends that overlap other strips."""
+    """Return the blending weight of each row in a strip; it falls towards ends that overlap other strips."""
     places = np.arange(rows.start, rows.stop, dtype=np.float32)[:, None] + 0.5
     from_top = places - rows.start if rows.start > 0 else np.full_like(places, np.inf)
     from_bottom = rows.stop - places if rows.stop < height else np.full_like(places, np.inf)
@@ -387,7 +391,7 @@ def _strip_weights(rows: slice, height: int) -> Float[np.ndarray, "h 1"]:
 
 
 def _estimate(left: UInt8[np.ndarray, "h w 3"], maps: Maps) -> Estimate:
-    """Build the estimate from the network's maps of both views."""
+    """Build the estimate from the network's maps for both views."""
     right_px = maps.right_disparity_px
     assert right_px is not None
     disagreement_px, inside = measure_disagreement(maps.disparity_px, right_px)
@@ -405,12 +409,12 @@ def _confidence(
     inside: Bool[np.ndarray, "h w"],
     plain: Bool[np.ndarray, "h w"],
 ) -> Float[np.ndarray, "h w"]:
-    """Return the confidence from the network's log odds, or from the views' disagreement if it has none.
+    """Return the confidence, from the network's log odds if given, else from the views' disagreement.
 
     A pixel's match cannot be farther than the pixel itself, because both cameras see the nearest surface.
-    Where the right view's disparity says that it is, one of the two views is wrong, and the network's
-    probability is halved: on collages and real pairs, about a quarter of such pixels are right, while the
-    network claims 0.4 to 0.5. The confidence is 0 where the left image is plain.
+    Where the right view's disparity contradicts this, one of the two views is wrong, and the network's
+    probability is halved. On collages and real pairs, about a quarter of such pixels are right, while the
+    network claims a probability of 0.4 to 0.5. The confidence is 0 where the left image is plain.
 
     Args:
         logit: The network's log odds; None if the network has no such output.
@@ -430,7 +434,7 @@ def _confidence(
 
 
 def _find_plain(image: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
-    """Return the mask of plain pixels: local means in the window around them are nearly equal."""
+    """Return the mask of plain pixels, those with nearly equal local means in the window around them."""
     window = np.ones((_PLAIN_WINDOW_PX, _PLAIN_WINDOW_PX), np.uint8)
     means = cv2.blur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (_PLAIN_MEAN_PX, _PLAIN_MEAN_PX))
     contrast = cv2.morphologyEx(means, cv2.MORPH_GRADIENT, window)

@@ -8,23 +8,23 @@ from jaxtyping import Bool, Float32, Int
 
 from stereoweave.stereo import Estimate
 
-# The median of this many visible pixels represents one end of a run: the first alone often mixes two
-# surfaces.
+# The median of this many visible pixels represents one end of a run, because the first pixel alone often
+# mixes two surfaces.
 _END_PX = 7
 _MEDIAN_PX = 5
-# The network's disparity is kept where it differs from the fill by more than this and lies within the
-# disparities of the surrounding visible pixels, because the fill is less accurate in this case. The
-# surroundings are 11x11 points of a grid with a spacing of 4 px.
+# The network's disparity is kept where it differs from the fill by more than this and lies within the range
+# of the surrounding visible disparities, because the fill is less accurate in this case. The surroundings are
+# 11x11 points of a grid with a spacing of 4 px.
 _FAR_OFF_PX = 10.0
 _SPACING_PX, _AROUND = 4, 11
-# Weight of the background's confidence in a filled pixel; the network's confidence has the rest. Fitted on
-# collages and rendered pairs: the network's confidence alone is 0.02 to 0.12 too low, the mixture is off by
-# 0.02 to 0.06.
+# Weight of the background's confidence in a filled pixel; the remaining weight goes to the network's
+# confidence. The weight is fitted to collages and rendered pairs: the network's confidence alone is 0.02 to
+# 0.12 too low, and the mixture is off by 0.02 to 0.06.
 _SHARE_BESIDE = np.float32(0.4)
 
 
 def fill_occluded(estimate: Estimate, left_seen: Bool[np.ndarray, "h w"] | None = None) -> Estimate:
-    """Give occluded pixels the disparity of the farther visible surface in their row.
+    """Fill occluded pixels with the disparity of the farther visible surface in their row.
 
     Visible pixels and the `occluded` mask do not change. A filled pixel's confidence moves towards the
     confidence of the surface that fills it, but a confidence of 0 stays 0.
@@ -102,7 +102,7 @@ def _within_surroundings(
     rows: Int[np.ndarray, " n"],
     columns: Int[np.ndarray, " n"],
 ) -> Bool[np.ndarray, " n"]:
-    """Return whether each pixel's disparity lies within the range of the visible pixels around it."""
+    """Return whether each pixel's disparity lies within the range of the visible disparities around it."""
     some = np.s_[::_SPACING_PX, ::_SPACING_PX]
     known, some_px = visible[some], disparity_px[some]
     window = np.ones((_AROUND, _AROUND), np.uint8)

@@ -15,8 +15,8 @@ class MatchOptions:
     """Matching options, validated on construction.
 
     Attributes:
-        range_px: Least and greatest disparity of the left view in px; disparities outside are clipped and get
-            confidence 0. Default: the network's range, extended if the pair exceeds it.
+        range_px: Least and greatest disparity of the left view in px; disparities outside the range are
+            clipped and get confidence 0. Default: the network's range, extended if the pair exceeds it.
         refined: Match once more at full resolution with the network's disparity as prior, which is slower but
             recovers thin structures and sharper edges.
         raw: Return the network's disparity without subpixel refinement and occlusion filling.
@@ -35,7 +35,7 @@ class MatchOptions:
         check_flag("raw", self.raw)
         if self.refined and self.raw:
             raise StereoweaveError(
-                "cannot be combined with refined, because it is the network's own disparity",
+                "cannot be combined with refined, because raw output is not post-processed",
                 setting="raw",
                 remedy=Remedy("leave one of them out", ("raw", "refined")),
             )

@@ -1,8 +1,8 @@
 """ONNX Runtime execution providers.
 
-If a provider is unavailable, ONNX Runtime logs a message and falls back to the CPU. Here this is an error: a
-request for a GPU never runs on the CPU unnoticed. Only operations that a provider lacks run on the next
-provider: CUDA after TensorRT, and finally the CPU.
+If a provider is unavailable, ONNX Runtime logs a message and falls back to the CPU. Here an error is raised
+instead, so a request for a GPU never runs on the CPU unnoticed. Only operations that a provider does not
+support run on the next provider: CUDA after TensorRT, and finally the CPU.
 """
 
 import contextlib
@@ -30,9 +30,10 @@ class Provider:
         name: The provider's name in ONNX Runtime.
         needs: Requirements, and how to install them.
         options: Function that returns ONNX Runtime's provider options for a number of threads.
-        then: Provider, a name in `PROVIDERS`, that runs the operations this one lacks.
-        batches: Whether batches of pairs are faster, as on a GPU. On a CPU they are slower because their maps
-            do not fit its caches (measured: 53 ms per pair of 320x240 in a batch of 8, 35 ms alone).
+        then: Name in `PROVIDERS` of the provider that runs the operations this provider does not support.
+        batches: Whether a batch of pairs is faster than single pairs, as on a GPU. On a CPU, batches are
+            slower because their feature maps do not fit in the caches (measured at 320x240: 53 ms per pair in
+            a batch of 8, 35 ms for a single pair).
     """
 
     name: str
@@ -48,7 +49,7 @@ def _cuda_options(threads: int) -> dict[str, str]:
         "cudnn_conv_algo_search": "HEURISTIC",
         # By default, the arena doubles whenever it grows, and takes memory that other processes may need.
         "arena_extend_strategy": "kSameAsRequested",
-        # TF32 has 10 mantissa bits: too few to match the CPU's disparities to a fraction of a pixel.
+        # TF32 has 10 mantissa bits, too few to match the CPU's disparities to a fraction of a pixel.
         "use_tf32": "0",
     }
 
@@ -76,7 +77,7 @@ def _openvino_options(threads: int) -> dict[str, str]:
 
 
 def _explain_replacement(package: str) -> str:
-    """Explain how to switch packages: they overwrite each other's files and cannot be installed together."""
+    """Explain how to replace onnxruntime, which cannot be installed together with `package`."""
     return (
         f"{package} instead of onnxruntime: pip uninstall onnxruntime {package}, then pip install {package}"
     )
@@ -117,7 +118,7 @@ PROVIDERS: dict[str, Provider] = {
 
 
 def check_provider(provider: str) -> None:
-    """Raise MatcherError if the provider is unknown or the installed ONNX Runtime lacks it."""
+    """Raise MatcherError if the provider is unknown or the installed ONNX Runtime does not include it."""
     import onnxruntime  # type: ignore[import-untyped]
 
     check_kind("provider", provider, str)
@@ -127,12 +128,13 @@ def check_provider(provider: str) -> None:
     if provider not in there:
         raise MatcherError(
             f"provider {provider}: expected an ONNX Runtime that includes it, found version "
-            f"{onnxruntime.__version__} with {', '.join(there)}; it needs {PROVIDERS[provider].needs}"
+            f"{onnxruntime.__version__} with {', '.join(there)}; "
+            f"the provider needs {PROVIDERS[provider].needs}"
         )
 
 
 def open_session(path: Path, provider: str, threads: int) -> Any:
-    """Open an ONNX Runtime session for a matcher file; `threads` applies to the CPU.
+    """Open an ONNX Runtime session for a matcher file, with `threads` threads on the CPU.
 
     Raises:
         MatcherError: The provider is unknown, unavailable or fails to start, or the file is invalid.
@@ -151,8 +153,8 @@ def open_session(path: Path, provider: str, threads: int) -> Any:
         raise _start_error(provider, "a missing library or device")
     if _runs_nothing(session, PROVIDERS[provider].name):
         raise MatcherError(
-            f"{path}: expected a matcher with operations that provider {provider} supports, found none of "
-            "them; export it for a fixed size with `stereoweave export`",
+            f"{path}: expected a matcher with operations that provider {provider} supports, found only "
+            "unsupported ones; export the matcher for a fixed size with `stereoweave export`",
             remedy=_USE_CPU,
         )
     return session
@@ -170,7 +172,7 @@ def explain_failure(provider: str, path: Path) -> Iterator[None]:
             raise _file_error(path, error) from error
         raise ProviderError(
             f"provider {provider}: failed to run {path.name}: {_first_line(error)}; "
-            "use smaller pictures, or fewer processes at a time on the device",
+            "use smaller pictures, or run fewer processes on the device at a time",
             remedy=None if provider == CPU else _USE_CPU,
         ) from error
 
@@ -181,7 +183,7 @@ def _create_session(path: Path, provider: str, threads: int) -> Any:
     options = onnxruntime.SessionOptions()
     # By default, ONNX Runtime mistakes two cores of a virtual machine for one core with two hardware threads.
     options.intra_op_num_threads = threads
-    # By default, its threads keep spinning after a run and slow down other work on the same cores.
+    # By default, the threads keep spinning after a run and slow down other work on the same cores.
     options.add_session_config_entry("session.force_spinning_stop", "1")
     options.log_severity_level = 4  # the error below reports problems with the file
     if provider != CPU:
@@ -192,7 +194,7 @@ def _create_session(path: Path, provider: str, threads: int) -> Any:
         names.append(PROVIDERS[names[-1]].then)
     providers = [(PROVIDERS[name].name, PROVIDERS[name].options(threads)) for name in names]
     try:
-        # Without a fallback to the CPU if the provider fails.
+        # Do not fall back to the CPU if the provider fails.
         return onnxruntime.InferenceSession(str(path), options, providers=providers, enable_fallback=0)
     except Exception as error:  # no common base class, as above
         raise _file_error(path, error) from error
@@ -212,7 +214,7 @@ def _load_libraries(provider: str) -> None:
 
 @contextmanager
 def _silence_log() -> Iterator[None]:
-    """Silence ONNX Runtime's log, whose messages are raised as errors instead."""
+    """Silence ONNX Runtime's log, because failures are raised as errors instead."""
     import onnxruntime
 
     onnxruntime.set_default_logger_severity(4)
@@ -223,7 +225,7 @@ def _silence_log() -> Iterator[None]:
 
 
 def _runs_nothing(session: Any, name: str) -> bool:
-    """Return whether the provider runs no operation of the graph; False before ONNX Runtime 1.24."""
+    """Return whether the provider runs none of the graph's operations; False before ONNX Runtime 1.24."""
     if not hasattr(session, "get_provider_graph_assignment_info"):
         return False
     return all(part.ep_name != name for part in session.get_provider_graph_assignment_info())
@@ -231,13 +233,13 @@ def _runs_nothing(session: Any, name: str) -> bool:
 
 def _start_error(provider: str, found: str) -> MatcherError:
     return MatcherError(
-        f"provider {provider}: failed to start: {found}; it needs {PROVIDERS[provider].needs}"
+        f"provider {provider}: failed to start: {found}; the provider needs {PROVIDERS[provider].needs}"
     )
 
 
 def _file_error(path: Path, error: Exception) -> MatcherError:
     return MatcherError(
-        f"{path}: expected an ONNX matcher file, found one that ONNX Runtime rejects: {_first_line(error)}"
+        f"{path}: expected an ONNX matcher file, found a file that ONNX Runtime rejects: {_first_line(error)}"
     )
 
 

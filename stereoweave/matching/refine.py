@@ -1,9 +1,9 @@
 """Refinement of an estimate by matching once more at full resolution, with the network's disparity as prior.
 
 The method is semi-global matching (Hirschmueller 2008) over all disparities between the network's least and
-greatest. A candidate's cost is the colour and census difference, plus its distance to the network's disparity
-weighted by confidence. Disparities on which both views agree replace the network's disparities. This recovers
-edges, and thin structures below the network's resolution.
+greatest disparity. A candidate's cost is the colour and census difference, plus the confidence-weighted
+distance to the network's disparity. Disparities on which both views agree replace the network's disparities.
+This recovers edges, as well as thin structures that are below the network's resolution.
 """
 
 import math
@@ -29,10 +29,10 @@ _CANDIDATES_MULTIPLE = 16
 # rows on each side.
 _CANDIDATES_AT_ONCE = 100_000_000
 _OVERLAP_PX = 24
-# Penalty of a large disparity step: greatest between equal grey levels, halved at this grey difference.
+# Penalty for a large disparity step: greatest between equal grey levels, halved at this grey difference.
 _LARGEST_STEP, _LEAST_LARGE_STEP = 125, 30
 _HALVING_LEVELS = 30
-# Factor on a pixel's confidence where the network's disparities of both views disagree.
+# Factor on a pixel's confidence where the network's disparities for the two views disagree.
 _DOUBTED = 0.2
 _SAME_PX = 1.0
 _MOST_THREADS = 4
@@ -46,8 +46,8 @@ def refine(
 ) -> Estimate:
     """Correct the disparities of both views by semi-global matching at full resolution.
 
-    The network's disparity is kept where matching confirms it to within 1.5 px (it is then the more precise
-    one), where its confidence is high, and where the two views disagree. The confidence does not change.
+    The network's disparity is kept where matching confirms it to within 1.5 px (the network is then more
+    precise), where its confidence is high, and where the two views disagree. The confidence does not change.
     Different exposures are equalised first.
 
     Args:
@@ -80,7 +80,7 @@ def _settle(
     trust: Float32[np.ndarray, "h w"],
     towards: int,
 ) -> Float32[np.ndarray, "h w"]:
-    """Replace a view's disparity with the one found, where both views agree on it."""
+    """Replace a view's disparities with the matched disparities at which both views agree."""
     from stereoweave.matching import refine_kernels as kernels  # Numba takes half a second to import
 
     settled_px = np.array(disparity_px, np.float32, order="C")
@@ -93,7 +93,7 @@ def _settle(
 def _match_views(
     pair: StereoPair, estimate: Estimate, threads: int
 ) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
-    """Match both views; return each view's disparities of least cost."""
+    """Match both views, and return the disparities of least cost in each view."""
     first_px, count = _candidates(estimate)
     left = _cues(pair.left, estimate.disparity_px - first_px, estimate.confidence)
     right = _cues(pair.right, estimate.right_disparity_px - first_px, right_confidence(estimate))
@@ -115,7 +115,7 @@ def _match_strip(
 ) -> Float32[np.ndarray, "2 h w"]:
     """Match a strip of rows of both views, each given as the left view of a pair."""
     size = (*views[0][0].grey.shape, count)
-    # Both views share the buffers: allocating new memory takes as long as aggregating one path.
+    # Both views share the buffers, because allocating new memory takes as long as aggregating one path.
     costs, sums = np.empty(size, np.uint8), np.empty(size, np.uint16)
     return np.stack([_match_view(own, other, (costs, sums), first_px, threads) for own, other in views])
 
@@ -156,7 +156,7 @@ def _candidates(estimate: Estimate) -> tuple[int, int]:
     """Return the first candidate disparity in px and the number of candidates."""
     both = estimate.disparity_px, estimate.right_disparity_px
     least_px = math.floor(min(view.min() for view in both))
-    # Parallel cameras have no disparities below 0; as candidates, they would attract a plain sky.
+    # Parallel cameras have no disparities below 0, and candidates below 0 would attract a plain sky.
     first_px = least_px - _MARGIN_PX if least_px < 0 else max(least_px - _MARGIN_PX, 0)
     last_px = math.ceil(max(view.max() for view in both)) + _MARGIN_PX
     count = last_px - first_px + 1
@@ -204,7 +204,7 @@ def right_confidence(estimate: Estimate) -> Float32[np.ndarray, "h w"]:
 
 
 def _large_steps(grey: UInt8[np.ndarray, "h w"], axis: int) -> UInt16[np.ndarray, "h w"]:
-    """Return the penalty of a large step between a pixel and the one before it; grey edges lower it."""
+    """Return the penalty for a large step from the previous pixel to each pixel, lower at grey edges."""
     before = grey.take([0, *range(grey.shape[axis] - 1)], axis)
     costs = _LARGEST_STEP / (1 + cv2.absdiff(grey, before).astype(np.float32) / _HALVING_LEVELS)
     return np.maximum(costs, _LEAST_LARGE_STEP).astype(np.uint16)

@@ -1,9 +1,9 @@
-"""Numba kernels of `refine`, in the order of their calls.
+"""Numba kernels of `refine`, in the order in which they are called.
 
 The plain reference implementation is tests/helpers/plain_refining.py. All kernels process a left view; the
 right view is processed as the left view of the mirrored pair. Volumes are [H, W, D]. Candidate i is the
 disparity first_px + i. The columns of the other image's `Cues` are reversed, so the candidates of column x,
-which are W - 1 - x + i, are contiguous in memory.
+at W - 1 - x + i, are contiguous in memory.
 """
 
 import typing
@@ -15,37 +15,37 @@ from stereoweave.system.jit import inlined, kernel
 SUBSTEPS = 8
 """Number of steps per px in which a candidate's distance to the network's disparity is measured."""
 DOUBTLESS, FARTHEST = np.uint16(SUBSTEPS), np.uint16(8 * SUBSTEPS)
-"""Distance to the network's disparity that costs nothing, and the excess from which the cost is greatest."""
+"""Distance to the network's disparity up to which the cost is 0, and the excess at which it is greatest."""
 MOST_TRUST = 12
-"""Greatest cost of a distance to the network's disparity, reached at confidence 1."""
+"""Greatest cost of the distance to the network's disparity, reached at confidence 1."""
 MOST_DIFFERENCE = np.uint8(40)
-"""Limit of a channel's difference: all greater differences mean a different surface."""
+"""Upper limit of a channel's difference, because all greater differences mean a different surface."""
 SMALL_STEP = 20
-"""Penalty of a disparity step of one candidate between two pixels of a path."""
+"""Penalty for a disparity step of one candidate between two pixels of a path."""
 PRECISE_PX = 1.5
-"""Within this distance of the disparity found, the network's disparity is the more precise one."""
+"""Within this distance of the matched disparity, the network's disparity is more precise."""
 CERTAIN = 0.85
 """Above this confidence, replacing the network's disparities does more harm than good."""
 AGREED_PX = 1.0
-"""Greatest difference between the two views' disparities of the same point."""
+"""Greatest difference at which the two views' disparities agree."""
 RELIABLE_RUN = 8
 SLACK_PX = 2
 LARGEST_MOVE_PX = 24
-"""Beyond this distance, the network's disparity at the border belongs to another surface."""
+"""A network's disparity at the border that differs by more than this belongs to another surface."""
 _CENSUS_RADIUS = 2
 _NEVER = np.uint16(30000)
 _SIX = np.uint16(6)
-# Numba widens sums to 64 bits unless both operands are narrow; a vector then holds half as many elements.
+# Numba widens sums to 64 bits unless both operands are narrow; wide sums would halve the vectors' length.
 _ONE, _TWO, _FOUR, _TOP = (np.uint32(bits) for bits in (1, 2, 4, 24))
 _PAIRS, _FOURS, _EIGHTS, _SUM = (np.uint32(mask) for mask in (0x55555555, 0x33333333, 0x0F0F0F0F, 0x01010101))
 
 
 class Cues(typing.NamedTuple):
-    """Inputs of the matching cost for each pixel of an image; C-contiguous arrays [H, W].
+    """Inputs to the matching cost for each pixel of an image; C-contiguous arrays [H, W].
 
     Attributes:
-        grey: uint8, grey levels, which determine the penalty of large disparity steps.
-        census: uint32, one bit for each of the 24 surrounding pixels: whether it is darker.
+        grey: uint8, grey levels, which determine the penalty for large disparity steps.
+        census: uint32, one bit for each of the 24 surrounding pixels, set if that pixel is darker.
         colour: uint8 [H, 3, W].
         darkest: uint8 [H, 3, W], least level within half a pixel to either side.
         brightest: uint8 [H, 3, W], greatest level within half a pixel to either side.
@@ -65,7 +65,7 @@ class Cues(typing.NamedTuple):
 @kernel
 @typing.no_type_check
 def census(grey, codes):
-    """Write the 5x5 census code of each pixel into codes: one bit per neighbour, set for a darker one."""
+    """Write each pixel's 5x5 census code into codes: one bit per neighbour, set if it is darker."""
     height, width = grey.shape
     for y in range(height):
         for x in range(width):
@@ -124,7 +124,7 @@ def _at(channels, y, x):
 @inlined
 @typing.no_type_check
 def _along(channels, y, start, end):
-    """Return the three channels of columns start..end of row y; `channels` is [H, 3, W]."""
+    """Return the three channels of columns start..end in row y; `channels` is [H, 3, W]."""
     return channels[y, 0, start:end], channels[y, 1, start:end], channels[y, 2, start:end]
 
 
@@ -139,7 +139,10 @@ def _add_census(code, codes, costs):
 @inlined
 @typing.no_type_check
 def _pull(prior, trust, candidate):
-    """Return the cost of a candidate's distance to the network's disparity, which rises from 1 px to 9 px."""
+    """Return the cost of a candidate's distance to the network's disparity.
+
+    The cost is 0 up to a distance of 1 px and constant from 9 px.
+    """
     away = np.uint16(max(prior, candidate) - min(prior, candidate))
     beyond = np.uint16(max(away, DOUBTLESS) - DOUBTLESS)
     return np.uint16(np.uint16(min(beyond, FARTHEST) * trust) >> _SIX)
@@ -148,7 +151,7 @@ def _pull(prior, trust, candidate):
 @inlined
 @typing.no_type_check
 def _add_pulls(prior, trust, priors, trusts, costs):
-    """Add the cost of the distances to the network's disparities in both views."""
+    """Add the cost of each candidate's distance to the network's disparities in both views."""
     for i in range(costs.shape[0]):
         candidate = np.uint16(SUBSTEPS * i)
         pulls = _pull(prior, trust, candidate) + _pull(priors[i], trusts[i], candidate)
@@ -158,7 +161,7 @@ def _add_pulls(prior, trust, priors, trusts, costs):
 @kernel
 @typing.no_type_check
 def match(own, other, first, last, costs):
-    """Write the matching cost of each candidate into rows first..last of costs, uint8."""
+    """Write the matching cost of each candidate into rows first..last of costs (uint8)."""
     _, width, count = costs.shape
     for y in range(first, last):
         for x in range(width):
@@ -197,9 +200,9 @@ def _step(before, least, costs, large_step, after, sums):
 @kernel
 @typing.no_type_check
 def along_rows(costs, large_step, first, last, sums):
-    """Write the summed costs of the paths from left and right into rows first..last of sums.
+    """Write the summed costs of the paths from the left and the right into rows first..last of sums.
 
-    large_step [H, W] is the penalty of a large step between a pixel and the one before it.
+    large_step [H, W] is the penalty for a large step from the previous pixel to each pixel.
     """
     _, width, count = costs.shape
     paths = np.empty((2, count + 2), np.uint16)
@@ -239,7 +242,7 @@ def along_columns(costs, large_step, first, last, sums):
 @inlined
 @typing.no_type_check
 def _between(before, here, after):
-    """Return the subpixel offset, -0.5..0.5, where two lines of opposite slope through three costs meet."""
+    """Return the offset, -0.5..0.5 px, at which two lines of opposite slope through three costs meet."""
     rise = max(np.int32(before), np.int32(after)) - np.int32(here)
     return 0.5 * (np.int32(before) - np.int32(after)) / rise if rise > 0 else 0.0
 
@@ -247,7 +250,7 @@ def _between(before, here, after):
 @kernel
 @typing.no_type_check
 def pick(sums, first_px, first, last, found_px):
-    """Write the disparities of least cost, with subpixel offset, into rows first..last of found_px."""
+    """Write the disparities of least cost, with subpixel offsets, into rows first..last of found_px."""
     _, width, count = sums.shape
     for y in range(first, last):
         for x in range(width):
@@ -266,10 +269,11 @@ def pick(sums, first_px, first, last, found_px):
 @kernel
 @typing.no_type_check
 def settle(found_px, other_px, trust, towards, disparity_px, agreed):
-    """Mark in agreed the pixels where both views agree, and replace the network's disparity of these pixels.
+    """Write the mask of pixels at which both views agree into agreed, and replace their disparities.
 
-    The network's disparity is kept if its confidence `trust` is at least CERTAIN, or if it is off by at most
-    PRECISE_PX. towards is -1 if the match of column x is at x - disparity, 1 if it is at x + disparity.
+    The network's disparity is kept if its confidence `trust` is at least CERTAIN, or if it differs by at
+    most PRECISE_PX. towards is -1 if the match of column x is at x - disparity, and 1 if it is at
+    x + disparity.
     """
     height, width = found_px.shape
     for y in range(height):
@@ -285,11 +289,11 @@ def settle(found_px, other_px, trust, towards, disparity_px, agreed):
 @kernel
 @typing.no_type_check
 def extend(agreed, trust, towards, disparity_px):
-    """Extend the first surface of each row to the image border, where the other camera sees nothing.
+    """Extend the first surface of each row to the image border, which the other camera does not see.
 
-    A surface is a run of RELIABLE_RUN agreed pixels. It is extended if all pixels between it and the border
-    have their matches outside the other image. Disparities that are certain, or that differ from the surface
-    by more than LARGEST_MOVE_PX, are kept.
+    A surface is a run of RELIABLE_RUN pixels at which both views agree. It is extended if the matches of all
+    pixels between the surface and the border are outside the other image. Disparities that are certain, or
+    that differ from the surface by more than LARGEST_MOVE_PX, are kept.
     """
     height, width = agreed.shape
     for y in range(height):

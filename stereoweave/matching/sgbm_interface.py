@@ -19,11 +19,11 @@ _LARGEST_PX = 2047
 
 
 class StereoMatcher:
-    """Replacement for cv2.StereoSGBM; `compute` returns int16 disparity * 16.
+    """Replacement for cv2.StereoSGBM; `compute` returns int16 disparities in 1/16 px.
 
-    minDisparity and numDisparities have the same names and meaning as in OpenCV. Parameters of OpenCV's
+    minDisparity and numDisparities have the same meaning as in OpenCV. Parameters of OpenCV's
     algorithm (blockSize, P1, P2, disp12MaxDiff, preFilterCap, uniquenessRatio, speckleWindowSize,
-    speckleRange, mode) do not apply to a network and raise a TypeError.
+    speckleRange and mode) do not apply to a network and raise a TypeError.
 
     Args:
         minDisparity: Least disparity in px; negative for converged cameras.
@@ -33,10 +33,10 @@ class StereoMatcher:
         threads: Maximum number of threads per call; default: all cores.
         provider: See `stereoweave.estimate`.
         refined: See `stereoweave.estimate`.
-        min_confidence: Pixels with a lower confidence are invalid.
+        min_confidence: Least confidence of a valid pixel.
     """
 
-    def __init__(  # noqa: PLR0913 - two parameters of OpenCV and those of a matcher
+    def __init__(  # noqa: PLR0913 - two of OpenCV's parameters, and a matcher's
         self,
         minDisparity: int = 0,
         numDisparities: int = 192,
@@ -52,14 +52,16 @@ class StereoMatcher:
         self._least_px, self._count, self._refined = minDisparity, numDisparities, refined
         self._min_confidence = min_confidence
         if not 0 <= min_confidence <= 1:
-            raise StereoweaveError(f"min_confidence: expected a probability, 0 to 1, found {min_confidence}")
+            raise StereoweaveError(
+                f"min_confidence: expected a probability from 0 to 1, found {min_confidence}"
+            )
         self._check_range()
         self._matcher = Backend(model=model, threads=threads, provider=provider).matcher()
 
     def compute(
         self, left: UInt8[np.ndarray, "h w *channels"], right: UInt8[np.ndarray, "h w *channels"]
     ) -> Int16[np.ndarray, "h w"]:
-        """Return the disparity of the left image in px * 16; invalid pixels are (minDisparity - 1) * 16.
+        """Return the left image's disparity in 1/16 px; invalid pixels are (minDisparity - 1) * 16.
 
         A pixel is invalid if it is occluded, if its confidence is below min_confidence, or if its disparity
         is outside minDisparity to minDisparity + numDisparities.
@@ -98,9 +100,9 @@ class StereoMatcher:
         # The value below minDisparity marks invalid pixels.
         if self._count < 1 or least_px - 1 < -_LARGEST_PX or most_px > _LARGEST_PX:
             raise StereoweaveError(
-                f"expected numDisparities of 1 or more, and disparities between {1 - _LARGEST_PX} and "
-                f"{_LARGEST_PX} px, the range of int16 / 16, found minDisparity {least_px} and "
-                f"numDisparities {self._count}; use stereoweave.estimate, which returns floats"
+                f"expected numDisparities of at least 1 and disparities from {1 - _LARGEST_PX} to "
+                f"{_LARGEST_PX} px, which fit in int16 in units of 1/16 px, found minDisparity {least_px} "
+                f"and numDisparities {self._count}; use stereoweave.estimate, which returns floats"
             )
 
 
@@ -108,7 +110,7 @@ def _rgb_of_bgr(picture: UInt8[np.ndarray, "h w *channels"], name: str) -> UInt8
     # PIL images and tensors are RGB and would be misread as BGR.
     if not isinstance(picture, np.ndarray) or picture.dtype != np.uint8:
         raise StereoweaveError(
-            f"{name}: expected a uint8 array, BGR [H, W, 3] or grey [H, W], as cv2.imread returns it, "
+            f"{name}: expected a uint8 array, BGR [H, W, 3] or grey [H, W], as returned by cv2.imread, "
             f"got {getattr(picture, 'dtype', type(picture).__name__)}"
         )
     return np.ascontiguousarray(as_rgb(picture, name)[..., ::-1])

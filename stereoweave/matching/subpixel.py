@@ -17,12 +17,12 @@ _PLAIN = 4.0
 # Horizontal derivative without the blur of a Sobel filter.
 _SLOPE = np.array([[1, -8, 0, 8, -1]], np.float32) / 12
 # Widths in pixels of the half-resolution grid, on which all smooth quantities are computed: smoothing before
-# matching, matching window, smoothing after matching.
+# matching, matching window, and smoothing after matching.
 _SMOOTH_SIGMA, _WINDOW_SIGMA, _FOUND_SIGMA = 2.0, 0.8, 3.0
-# There is a depth edge where the disparity differs from its mean in a window of that grid by more than this.
+# There is a depth edge where the disparity differs by more than this from its mean in a window of that grid.
 _EDGE_PX, _EDGE_PLACES = 0.5, 5
-# Bands of rows: overlap on each side, as far as a pixel's result depends on others; least number of rows for
-# which a thread is worthwhile; greatest number of pixels at once, each of which takes 40 bytes.
+# Bands of rows: the overlap on each side, as far as a pixel's result depends on others; the least number of
+# rows for which a thread is worthwhile; and the greatest number of pixels at once, at 40 bytes per pixel.
 _REACH_PX = 32
 _LEAST_BAND_PX = 64
 _BAND_PIXELS = 2_000_000
@@ -35,16 +35,17 @@ def to_subpixel(
     estimate: Estimate,
     threads: int | None = None,
 ) -> Estimate:
-    """Refine the left view's disparity by at most 1 px to align the images best.
+    """Refine the left view's disparity by at most 1 px for the best alignment of the images.
 
     In a window around each pixel, one least-squares step aligns the right image, warped by the disparity,
     with the left image. Source: B. Lucas and T. Kanade, "An iterative image registration technique with an
-    application to stereo vision", 1981. Three deviations:
+    application to stereo vision", 1981. This implementation deviates in three ways:
 
     - Contrast is equalised and window means are subtracted, so different exposures cause no shift.
     - Disparity is smoothed before and after the step, but not across edges. Errors of opposite sign then
-      cancel out (median depth error of walls 0.9 -> 0.5 %).
-    - No step is made near depth edges, where a window covers two surfaces (bad-1 near edges 31.3 -> 30.1 %).
+      cancel out, which reduces the median depth error of walls from 0.9 to 0.5 %.
+    - No step is made near depth edges, where a window covers two surfaces. This reduces bad-1 near edges from
+      31.3 to 30.1 %.
 
     Occluded pixels do not change.
 
@@ -58,7 +59,7 @@ def to_subpixel(
     gain = _gain(here, there, estimate)
     here, there = _pad_to_even(here), _pad_to_even(there)
     given_px = _pad_to_even(estimate.disparity_px.astype(np.float32))
-    # Parallel cameras have no disparities below 0; this keeps a plain sky from getting them.
+    # Parallel cameras have no disparities below 0; this prevents negative disparities in a plain sky.
     least_px = min(float(given_px.min()), 0.0)
     found_px = np.empty_like(given_px)
 
@@ -87,7 +88,7 @@ def _pad_to_even(values: np.ndarray) -> np.ndarray:
 
 
 def _gain(here: UInt8[np.ndarray, "h w"], there: UInt8[np.ndarray, "h w"], estimate: Estimate) -> float:
-    """Return the ratio of left to right contrast: standard deviations over a sample of the visible pixels."""
+    """Return the ratio of left to right contrast, measured on a sample of the visible pixels."""
     some = np.s_[::_GAIN_STEP_PX, ::_GAIN_STEP_PX]
     rows, columns = _GAIN_STEP_PX * np.argwhere(~estimate.occluded[some]).T
     if not rows.size:
@@ -105,7 +106,7 @@ def _refine_band(
     given_px: Float32[np.ndarray, "h w"],
     gain: float,
 ) -> Float32[np.ndarray, "h w"]:
-    """Refine the disparity of a band of rows of the left view, whose height and width are even."""
+    """Refine the disparity of a band of rows in the left view; the band has an even height and width."""
     coarse_px = _halve(given_px)
     smooth_px = _double(_smooth(coarse_px, _SMOOTH_SIGMA))
     start_px = np.where(cv2.absdiff(smooth_px, given_px) < _SAME_PX, smooth_px, given_px)
@@ -135,7 +136,10 @@ def _missing_px(
 
 
 def _near_edge(coarse_px: Float32[np.ndarray, "h2 w2"]) -> Bool[np.ndarray, "h2 w2"]:
-    """Return the mask of pixels near depth edges; a slanted plane equals its local mean and has no edge."""
+    """Return the mask of pixels near depth edges.
+
+    A slanted plane has no edges, because it equals its local mean.
+    """
     around = (_EDGE_PLACES, _EDGE_PLACES)
     off_px = cv2.absdiff(coarse_px, cv2.blur(coarse_px, around))
     return cv2.dilate(off_px, np.ones(around, np.uint8)) > _EDGE_PX
@@ -147,7 +151,7 @@ def _smooth(coarse_px: Float32[np.ndarray, "h2 w2"], sigma: float) -> Float32[np
 
 
 def _window(values: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h2 w2"]:
-    """Return the means of windows on the coarse grid."""
+    """Return the weighted mean in the window around each pixel of the coarse grid."""
     return cv2.GaussianBlur(_halve(values), (0, 0), _WINDOW_SIGMA)
 
 

@@ -1,10 +1,10 @@
 """Upsampling of a downscaled pair's estimate to full size, with edges aligned to the full-size images.
 
-Each level is at most twice as large as the previous one, whose disparities are its prior. Semi-global
-matching (Hirschmueller 2008), with candidates near the prior's surfaces only (as in Rothermel et al. 2012),
+Each level is at most twice as large as the previous level, whose disparities serve as the prior. Semi-global
+matching (Hirschmueller 2008), with candidates only near the prior's surfaces (as in Rothermel et al. 2012),
 locates the surfaces' edges and refines their disparity to a fraction of a pixel. Images are processed in
-strips of rows. The state of the vertical paths passes from strip to strip, so the result does not depend on
-the strips' height.
+strips of rows. The state of the vertical paths is passed from strip to strip, so the result does not depend
+on the strips' height.
 """
 
 from collections.abc import Callable
@@ -27,10 +27,10 @@ _CENSUS_PX = 2
 _SURFACES_PX = 5
 # There is an edge where these surfaces differ by this much, in pixels of the smaller images.
 _EDGE_PX = 1.5
-# Cost per px of a candidate's distance to its surface, counted from _FREE_PX to _FARTHEST_PX: disparities of
-# the smaller images are accurate to about half a pixel of those images.
+# Cost per px of a candidate's distance to its surface. Only distances from _FREE_PX to _FARTHEST_PX count,
+# because disparities of the smaller images are accurate to about half a pixel of those images.
 _PULL, _FREE_PX, _FARTHEST_PX = 2, 1, 8
-# Penalty of a large disparity step: greatest between equal grey levels, halved at this grey difference.
+# Penalty for a large disparity step: greatest between equal grey levels, halved at this grey difference.
 _LARGEST_STEP, _LEAST_LARGE_STEP = 125, 30
 _HALVING_LEVELS = 30
 # A prior that is off by at most this is corrected by the mean difference in a window of this size.
@@ -39,22 +39,22 @@ _MEAN_PX = 9
 _LEAST_SHARE, _LEAST_SHARE_AROUND = 0.3, 0.02
 _SETTLED_ROWS = 256
 # Factor on the prior's confidence, and upper limit of the result. On collages, disparities that follow the
-# prior are right as often as its confidence claims, those on which the views disagree 85 % as often, and
-# changed ones half the time.
+# prior are right as often as its confidence claims, disparities on which the views disagree are right 85 % as
+# often, and changed disparities are right half the time.
 _FOLLOWS, _UNSEEN, _CHANGED = 0, 1, 2
 _LEFT_OF_CONFIDENCE = np.array([1, 0.85, 1], np.float32)
 _MOST_CONFIDENCE = np.array([1, 1, 0.5], np.float32)
 
 
 class _StripCues(NamedTuple):
-    """Inputs of a strip's matching cost: census codes, uint32 [H, W], and grey levels, uint8 [H, W]."""
+    """Inputs to a strip's matching cost: census codes, uint32 [H, W], and grey levels, uint8 [H, W]."""
 
     codes: UInt32[np.ndarray, "h w"]
     levels: UInt8[np.ndarray, "h w"]
 
 
 class _Paths(NamedTuple):
-    """State of the vertical paths at a row, for `upsample_kernels.along_columns`."""
+    """State of the vertical paths after a row, for `upsample_kernels.along_columns`."""
 
     costs: UInt16[np.ndarray, "w path"]
     least: UInt16[np.ndarray, " w"]
@@ -62,7 +62,7 @@ class _Paths(NamedTuple):
 
 
 class _StripView:
-    """A left view with its prior, read in strips of rows.
+    """A left view with its prior, processed in strips of rows.
 
     Args:
         grey: Left image.
@@ -87,7 +87,7 @@ class _StripView:
         )
 
     def prior_px(self, rows: slice) -> Float32[np.ndarray, "h w"]:
-        """Return the smaller images' disparity, interpolated at each pixel of the rows."""
+        """Return the smaller images' disparity, interpolated at each pixel in the rows."""
         height, smaller = len(self.grey), len(self._columns_px)
         places = np.clip((np.arange(height)[rows] + 0.5) * smaller / height - 0.5, 0, smaller - 1)
         above = np.minimum(places.astype(int), smaller - 2)
@@ -95,7 +95,7 @@ class _StripView:
         return (1 - share) * self._columns_px[above] + share * self._columns_px[above + 1]
 
     def surfaces_px(self, rows: slice) -> list[Float32[np.ndarray, "h w"]]:
-        """Return the disparities of the farthest and the nearest surface around each pixel of the rows."""
+        """Return the disparities of the farthest and the nearest surface around each pixel."""
         return [surface[self._rows[rows]][:, self._columns] for surface in self._surfaces_px]
 
     def cues(self, rows: slice, threads: int) -> tuple[_StripCues, _StripCues]:
@@ -108,7 +108,7 @@ class _StripView:
         return own, _StripCues(*(np.pad(cue[:, ::-1], more, mode="edge") for cue in other))
 
     def first_candidates(self, rows: slice) -> Int16[np.ndarray, "h w 2"]:
-        """Return the least disparity of each pixel's two bands of candidates."""
+        """Return the least disparity in each pixel's two bands of candidates."""
         from stereoweave.matching import upsample_kernels as kernels
 
         farthest_px, nearest_px = self.surfaces_px(rows)
@@ -124,12 +124,12 @@ class _StripView:
         return nearest_px - farthest_px > _EDGE_PX * self._scale
 
     def steps_along(self, rows: slice) -> UInt16[np.ndarray, "h w1"]:
-        """Return the penalty of a large step between each column and the one before it."""
+        """Return the penalty for a large step from the previous column to each column."""
         grey = self.grey[rows]
         return np.pad(_large_steps(grey[:, 1:], grey[:, :-1]), ((0, 0), (1, 1)))
 
     def steps_down(self, rows: slice) -> UInt16[np.ndarray, "h1 w"]:
-        """Return the penalty of a large step before each row and after the last one."""
+        """Return the penalty for a large step before each row and after the last row."""
         grey = self.grey[max(rows.start - 1, 0) : rows.stop + 1]
         ends = rows.start == 0, rows.stop == len(self.grey)
         return np.pad(_large_steps(grey[1:], grey[:-1]), (ends, (0, 0)))
@@ -143,8 +143,8 @@ def enlarge(
 ) -> Estimate:
     """Upsample the estimate of a downscaled pair to full size.
 
-    The disparities are in px of the full-size images. Confidence is lowered where the full-size images
-    contradict the smaller ones, and occlusion is recomputed.
+    The resulting disparities are in px of the full-size images. Confidence is lowered where the full-size
+    images contradict the smaller images, and occlusion is recomputed.
 
     Args:
         left: Left image, uint8 RGB [H, W, 3].
@@ -160,7 +160,7 @@ def enlarge(
 
 
 def _divisors(width: int, smaller: int) -> list[int]:
-    """Return the downscaling factors of the levels, of which the last is 1."""
+    """Return the downscaling factor of each level; the last factor is 1."""
     divisor = 1
     while width / (2 * divisor) > smaller:
         divisor *= 2
@@ -192,13 +192,13 @@ def _upsample_level(
 
 
 def _match_view(view: _StripView, threads: int) -> Float32[np.ndarray, "h w"]:
-    """Match a left view strip by strip; return its disparities of least cost."""
+    """Match a left view strip by strip, and return its disparities of least cost."""
     from stereoweave.matching import upsample_kernels as kernels
 
     height, width = view.grey.shape
     count = 2 * kernels.BAND
     strips = _strips(height, max(_STRIP_BYTES // (3 * width * count), _LEAST_ROWS))
-    # All strips share the buffers: allocating new memory takes as long as aggregating one path.
+    # All strips share the buffers, because allocating new memory takes as long as aggregating one path.
     volumes = (np.empty((strips[0].stop, width, count), dtype) for dtype in (np.uint8, np.uint16))
     costs, sums = volumes
     found_px = np.empty((height, width), np.float32)
@@ -239,13 +239,13 @@ class _Strip:
         self._in_bands(lambda *band: kernels.match(own, other, self._first, pull, band, self._costs), 0)
 
     def run_along(self) -> None:
-        """Write the summed costs of both horizontal paths into the sums."""
+        """Write the sum of the costs of both horizontal paths into the buffer of sums."""
         self._in_bands(
             lambda *band: self._kernels.along_rows(self._costs, self._first, self._along, band, self._sums), 0
         )
 
     def run_down(self, paths: _Paths, backwards: int) -> None:
-        """Add the costs of the path from above, or from below if backwards; update `paths`."""
+        """Add the costs of the path from above, or from below if `backwards` is 1, and update `paths`."""
         volumes = self._costs, self._first, self._down
         self._in_bands(
             lambda *band: self._kernels.along_columns(*volumes, backwards, band, *paths, self._sums), 1
@@ -281,7 +281,7 @@ def _settle(
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(settle, _strips(len(found_px), _SETTLED_ROWS)))
     if view.parallel:
-        # Parallel cameras have no disparities below 0; this keeps a plain sky from getting them.
+        # Parallel cameras have no disparities below 0; this prevents negative disparities in a plain sky.
         np.maximum(settled_px, 0, out=settled_px)
     return settled_px, doubt
 
@@ -340,7 +340,7 @@ def _strips(height: int, rows: int) -> list[slice]:
 
 
 def _cues(grey: UInt8[np.ndarray, "h w"], rows: slice) -> _StripCues:
-    """Return the cues of a strip of rows; its census codes also use the rows next to the strip."""
+    """Return the cues of a strip of rows; the census codes also use the rows next to the strip."""
     from stereoweave.matching import refine_kernels as kernels
 
     above = min(_CENSUS_PX, rows.start)
@@ -366,7 +366,7 @@ def _places(size: int, smaller: int) -> Int[np.ndarray, " n"]:
 def _large_steps(
     grey: UInt8[np.ndarray, "h w"], before: UInt8[np.ndarray, "h w"]
 ) -> UInt16[np.ndarray, "h w"]:
-    """Return the penalty of a large step between two pixels; grey edges lower it."""
+    """Return the penalty for a large step between two pixels; the penalty is lower at grey edges."""
     costs = _LARGEST_STEP / (1 + cv2.absdiff(grey, before).astype(np.float32) / _HALVING_LEVELS)
     return np.maximum(costs, _LEAST_LARGE_STEP).astype(np.uint16)
 

@@ -1,9 +1,9 @@
-"""Numba kernels of `upsample.enlarge`, in the order of their calls.
+"""Numba kernels of `upsample.enlarge`, in the order in which they are called.
 
 The plain reference implementation is tests/helpers/plain_enlarging.py. All kernels process a left view; the
 right view is processed as the left view of the mirrored pair. A pixel has two bands of BAND candidates,
-around the farthest and the nearest surface in its neighbourhood in the smaller images: candidate i of band b
-is the disparity first_candidate[y, x, b] + i. Volumes are [H, W, 2 * BAND]. H is the height of a strip.
+around the farthest and the nearest surface in its neighbourhood in the smaller images. Candidate i of band b
+is the disparity first_candidate[y, x, b] + i. Volumes are [H, W, 2 * BAND], where H is the height of a strip.
 """
 
 import typing
@@ -15,17 +15,17 @@ from stereoweave.system.jit import inlined, kernel
 
 BAND = 16
 MIDDLE = 8
-"""Index of the candidate whose disparity is that surface's."""
+"""Index of the candidate with the disparity of the band's surface."""
 SMALL_STEP = 12
-"""Penalty of a disparity step of one candidate between two pixels of a path."""
+"""Penalty for a disparity step of one candidate between two pixels of a path."""
 MOST_DIFFERENCE = np.uint8(40)
-"""Limit of the grey difference: all greater differences mean a different surface."""
+"""Upper limit of the grey difference, because all greater differences mean a different surface."""
 AGREED_PX = 1.0
-"""Greatest difference between the two views' disparities of the same point."""
+"""Greatest difference at which the two views' disparities agree."""
 FILL_PX = 8.0
 """A gap is filled only with disparities within this distance of the surfaces around it."""
-# Padding of a path: the previous pixel's band may start this many candidates before or after. Candidates in
-# the padding have cost NEVER.
+# Padding of a path: the previous pixel's band may start up to this many candidates before or after the
+# current pixel's band. Candidates in the padding have cost NEVER.
 _BESIDE = BAND + 2
 _ROOM = BAND + 2 * _BESIDE
 PATH = 2 * _ROOM
@@ -36,7 +36,7 @@ NEVER = np.uint16(30000)
 @inlined
 @typing.no_type_check
 def _compare(code, level, codes, levels, pull, costs):
-    """Write the costs of a band's candidates, given census codes, grey levels and costs of the positions."""
+    """Write the costs of a band's candidates, given census codes, grey levels and position costs."""
     for i in range(BAND):
         apart = np.uint8(max(level, levels[i]) - min(level, levels[i]))
         apart = np.uint8(min(apart, MOST_DIFFERENCE) >> np.uint8(1))
@@ -67,9 +67,10 @@ def match(own, other, first_candidate, pull, rows, costs):
 @inlined
 @typing.no_type_check
 def _step(before, least, moved, costs, large_step, after, sums):
-    """Advance a band's path by one pixel: write its costs into after, add them to sums, return the least.
+    """Advance a band's path by one pixel, and return the least cost.
 
-    moved is the first candidate of this pixel's band minus the first candidate of the previous pixel's band.
+    The costs are written into after and added to sums. moved is the first candidate of this pixel's band
+    minus the first candidate of the previous pixel's band.
     """
     limit = np.uint16(least + large_step)
     at = _BESIDE + min(max(moved, -BAND - 1), BAND + 1)
@@ -88,7 +89,7 @@ def _step(before, least, moved, costs, large_step, after, sums):
 @inlined
 @typing.no_type_check
 def _step_both(before, least, first, first_before, costs, large_step, after, sums):
-    """Advance the path of both bands by one pixel; return the least cost of both."""
+    """Advance the paths of both bands by one pixel, and return the least cost."""
     lowest = NEVER
     for band in range(2):
         room = slice(band * _ROOM, (band + 1) * _ROOM)
@@ -102,10 +103,10 @@ def _step_both(before, least, first, first_before, costs, large_step, after, sum
 @kernel
 @typing.no_type_check
 def along_rows(costs, first_candidate, large_step, rows, sums):
-    """Write the summed costs of the paths from left and right into the given rows of sums.
+    """Write the summed costs of the paths from the left and the right into the given rows of sums.
 
-    large_step [H, W + 1] is the penalty of a large step between a column and the one before it, 0 at both
-    ends.
+    large_step [H, W + 1] is the penalty for a large step from the previous column to each column; it is 0 at
+    both ends.
     """
     _, width, _ = costs.shape
     paths = np.full((2, PATH), NEVER, np.uint16)
@@ -128,9 +129,9 @@ def along_rows(costs, first_candidate, large_step, rows, sums):
 def along_columns(costs, first_candidate, large_step, backwards, columns, paths, least, first_before, sums):
     """Add the costs of the path from above, or from below if backwards is 1, to the given columns of sums.
 
-    large_step [H + 1, W] is the penalty of a large step between a row and the one before it, 0 at both ends
-    of the image. paths [W, PATH], least [W] and first_before [W, 2] are the paths' state after the previous
-    strip and are updated for the next one.
+    large_step [H + 1, W] is the penalty for a large step from the previous row to each row; it is 0 at both
+    ends of the image. paths [W, PATH], least [W] and first_before [W, 2] are the paths' state after the
+    previous strip and are updated for the next strip.
     """
     height, _, _ = costs.shape
     before = np.empty(PATH, np.uint16)
@@ -149,7 +150,7 @@ def along_columns(costs, first_candidate, large_step, backwards, columns, paths,
 @kernel
 @typing.no_type_check
 def pick(sums, first_candidate, rows, found_px):
-    """Write the disparities of least cost, with an equiangular line fit, into the given rows of found_px."""
+    """Write the least-cost disparities, with equiangular line fits, into the given rows of found_px."""
     _, width, _ = sums.shape
     for y in range(rows[0], rows[1]):
         for x in range(width):
@@ -172,7 +173,7 @@ def pick(sums, first_candidate, rows, found_px):
 @kernel
 @typing.no_type_check
 def agree(found_px, other_px, agreed):
-    """Write into agreed whether each pixel's disparity agrees with that of the other view at its match."""
+    """Write into agreed whether each pixel's disparity agrees with the other view's at its match."""
     height, width = found_px.shape
     for y in range(height):
         for x in range(width):
@@ -184,10 +185,10 @@ def agree(found_px, other_px, agreed):
 @kernel
 @typing.no_type_check
 def fill(known, gap, farthest_px, nearest_px, disparity_px):
-    """Fill each gap of a row with the farther of the known disparities at its two ends.
+    """Fill each gap in a row with the farther of the known disparities at its two ends.
 
     A gap is occluded by a nearer surface, so it belongs to the farther one. A pixel is filled only if the
-    disparity fits the surfaces around it, farthest_px to nearest_px.
+    disparity is close to the range of the surfaces around it, farthest_px to nearest_px.
     """
     height, width = known.shape
     for y in range(height):

@@ -31,7 +31,7 @@ ERRORS: dict[str, tuple[dict[str, str], dict[str, Any]]] = {
     "metres: expected a focal length in EXIF in addition to the baseline, found none; give the focal length "
     "(“Focal length, px”)": (PAIR, {"baseline": 100}),
     "“Rectify the pair”: expected at least 40 feature matches that agree on the camera positions, "
-    "found 0 of 0 matches; take pictures with more texture and more overlap; or give a "
+    "found 0 of 0 matches; photograph a scene with more texture and with more overlap; or give a "
     "calibration (“Calibration file, for metres”)": (
         {"left": "plain.png", "right": "plain.png"},
         {"rectify": True},

@@ -79,12 +79,14 @@ def test_measured_amounts_equal_the_simulated_ones(pairs):
 def test_the_lines_say_what_to_do(pairs):
     left, right = pairs[0]
     lower = check_pair(*ONE_DEFECT["vertical_shift"](left, right))
-    assert str(lower.lines()[-1]) == "the right picture lies 2.0 px lower; rectify the pair (rectify)"
+    assert str(lower.lines()[-1]) == (
+        "the right picture is 2.0 px lower than the left one; rectify the pair (rectify)"
+    )
     assert lower.warnings() == lower.lines()[-1:]
     assert str(check_pair(left, turned(right, -1)).lines()[-1]) == (
-        "the right picture is turned 1.0 degrees anticlockwise; rectify the pair (rectify)"
+        "the right picture is rotated 1.0 degrees anticlockwise; rectify the pair (rectify)"
     )
-    assert "2.0 times the other's exposure" in str(check_pair(left, brighter(right, -1)).lines()[-1])
+    assert "2.0 times the exposure of the other" in str(check_pair(left, brighter(right, -1)).lines()[-1])
     assert str(check_pair(right, left).lines()[-1]).startswith("left and right are swapped")
     assert str(check_pair(left, right).lines()[-1]).startswith("no defects")
 

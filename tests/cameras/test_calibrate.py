@@ -123,7 +123,7 @@ def test_a_bad_pair_is_named_and_the_rest_go_on(copied):
     assert set(found.left_out) == {f"left/{number}.png" for number in ("01", "02", "04", "99")}
     assert "no board was detected in the right picture" in found.left_out["left/01.png"]
     assert "02.png" in found.left_out["left/02.png"]
-    assert "left picture has 640x480 pixels, the right one 320x240" in found.left_out["left/04.png"]
+    assert "left picture has 640x480 pixels, but the right one has 320x240" in found.left_out["left/04.png"]
     assert "the picture of the other camera is missing" in found.left_out["left/99.png"]
     assert len(found.used) == 7
     assert found.rig.baseline_m == pytest.approx(0.1, rel=0.02)
@@ -184,7 +184,7 @@ def test_too_few_pairs_are_refused(copied):
 @pytest.mark.parametrize("name", ["nowhere", "empty"])
 def test_a_folder_without_pairs_is_refused(tmp_path, name):
     (tmp_path / "empty").mkdir()
-    with pytest.raises(StereoweaveError, match=f"{name}: expected .*, found none"):
+    with pytest.raises(StereoweaveError, match=f"{name}: expected .*, found (none|no such folder)"):
         calibrate(tmp_path / name, CHESSBOARD)
 
 

@@ -49,7 +49,7 @@ def test_a_pair_that_is_not_rectified_gets_one_note(example):
         left=np.ascontiguousarray(example.left[:-2]), right=np.ascontiguousarray(example.right[2:])
     )
     (line,) = find_problems(lower, estimate_of(lower, 0.1))
-    assert str(line) == "the right picture lies 2.0 px higher; rectify the pair (rectify)"
+    assert str(line) == "the right picture is 2.0 px higher than the left one; rectify the pair (rectify)"
 
 
 def test_negative_disparities_by_themselves_are_no_reason_for_a_line(example):

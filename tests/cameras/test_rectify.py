@@ -167,7 +167,7 @@ def test_assumptions_and_changes_are_noted(wall, rig, rng):
     assert "rotated by" in wall.notes[-1].text
     assumed = Note("metres were assumed")
     notes = rectify.rectify(noise(rng), replace(rig, name="rig.yml", notes=(assumed,))).notes
-    assert notes[0] == assumed and "rectified by rig.yml" in notes[1].text
+    assert notes[0] == assumed and "rectified with rig.yml" in notes[1].text
 
 
 @pytest.mark.parametrize(

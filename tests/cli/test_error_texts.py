@@ -30,19 +30,19 @@ ERRORS = {
     f"depth {PAIR} --baseline-m 0.1 -o out": "metres: expected a focal length in EXIF in addition to the "
     "baseline, found none; give the focal length (--focal-px)",
     "view plain.png plain.png --rectify -o out.png": "--rectify: expected at least 40 feature matches "
-    "that agree on the camera positions, found 0 of 0 matches; take pictures with more texture and "
-    "more overlap; or give a calibration (--calib)",
+    "that agree on the camera positions, found 0 of 0 matches; photograph a scene with more "
+    "texture and with more overlap; or give a calibration (--calib)",
     "rectify plain.png plain.png -o out": "rectify: expected at least 40 feature matches that agree on the "
-    "camera positions, found 0 of 0 matches; take pictures with more texture and more overlap; or give a "
-    "calibration (--calib)",
+    "camera positions, found 0 of 0 matches; photograph a scene with more texture and with more "
+    "overlap; or give a calibration (--calib)",
     "rectify both.png --format diagonal -o out": f"--format: expected one of {LAYOUTS}, mpo, jps, found "
     "'diagonal'",
     f"depth {PAIR} --write depth.npy -o out": f"depth.npy: {NO_CAMERA}",
     f"depth {PAIR} --write x.obj -o out": "--write: expected all or one of "
     f"{', '.join(FILES)}, found 'x.obj'",
     f"measure {PAIR} --from 1,2 --to 3,4": NO_CAMERA,
-    f"depth {PAIR} --raw --refined -o out": "--raw: cannot be combined with refined, because it is the "
-    "network's own disparity; leave one of them out (--raw, --refined)",
+    f"depth {PAIR} --raw --refined -o out": "--raw: cannot be combined with refined, because raw "
+    "output is not post-processed; leave one of them out (--raw, --refined)",
     f"depth {PAIR} --range 700,800 -o out": "--range: expected disparities between -640 and 640 px, the "
     "width of the pictures, got 700 and 800; omit it for automatic detection",
     f"depth {PAIR} --provider gpu -o out": "--provider: expected one of cpu, cuda, tensorrt, openvino, "
@@ -73,15 +73,15 @@ ERRORS = {
     "bench collages -o set --pairs 2 --size 64x16": "--size: expected at least 32x32 pixels, found 64x16",
 }
 NOTES = {
-    "check upper.png lower.png": "the right picture lies 2.0 px lower; rectify the pair (stereoweave "
-    "rectify)",
+    "check upper.png lower.png": "the right picture is 2.0 px lower than the left one; rectify the pair "
+    "(stereoweave rectify)",
     "check both.png": "side_by_side, detected from name and content; override it if it is wrong (--format)",
     "check right.png left.png": "left and right are swapped; give them the other way round",
     f"depth {PAIR} --focal-px 600 --baseline-m 0.1 --rectify -o out": "no metres after rectification by "
     "features; give a calibration (--calib)",
     f"depth {PAIR} --write all -o out": f"no depth, point cloud or mesh: {NO_CAMERA}",
-    "view upper.png lower.png --model small -o out.png": "the right picture lies 2.0 px lower; rectify the "
-    "pair (--rectify)",
+    "view upper.png lower.png --model small -o out.png": "the right picture is 2.0 px lower than the left "
+    "one; rectify the pair (--rectify)",
 }
 
 
@@ -116,7 +116,7 @@ def test_many_pairs_have_the_same_texts(capsys):
 def test_notes_on_a_video_do_not_advise_rectification(capsys):
     assert main(["video", "upper.png", "lower.png", "--depth", "-o", "out.mkv", "--threads", "1"]) == 0
     (line,) = [line for line in capsys.readouterr().err.splitlines() if "px lower" in line]
-    assert line == "0:00:00.000 the right picture lies 2.0 px lower"
+    assert line == "0:00:00.000 the right picture is 2.0 px lower than the left one"
 
 
 def test_a_folder_with_two_pairs_of_one_name_advises_a_list(capsys):

@@ -58,7 +58,7 @@ def test_a_pair_rectified_by_its_features_passes_the_check(turned, tmp_path, cap
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["left.png", "right.png"]
     pair = read_pair(tmp_path / "out" / "left.png", tmp_path / "out" / "right.png")
     assert check_pair(pair.left, pair.right).defects == ()
-    assert "rectified by" in capsys.readouterr().out
+    assert "rectified with" in capsys.readouterr().out
 
 
 def test_the_new_calibration_fits_the_new_pictures(tmp_path):
@@ -93,12 +93,12 @@ def test_a_pair_is_not_rectified_into_a_folder_to_which_another_command_writes(t
 
 def test_depth_and_view_warn_of_an_unrectified_pair_and_rectify_corrects_it(turned, tmp_path, capsys):
     assert main(["depth", LEFT, turned, "-o", str(tmp_path / "as_it_is")]) == 0
-    assert "is turned 1.0 degrees" in capsys.readouterr().out
+    assert "is rotated 1.0 degrees" in capsys.readouterr().out
     assert main(["depth", LEFT, turned, "--rectify", "-o", str(tmp_path / "mended")]) == 0
-    assert "is turned" not in capsys.readouterr().out
+    assert "is rotated" not in capsys.readouterr().out
     assert main(["view", LEFT, turned, "-o", str(tmp_path / "view.png")]) == 0
-    assert "is turned 1.0 degrees" in capsys.readouterr().out
+    assert "is rotated 1.0 degrees" in capsys.readouterr().out
     assert main(["view", LEFT, turned, "--rectify", "-o", str(tmp_path / "view.png")]) == 0
-    assert "is turned" not in capsys.readouterr().out
+    assert "is rotated" not in capsys.readouterr().out
     # The borders that rectification leaves are cut off.
     assert np.array_equal(np.less(read_image(tmp_path / "view.png").shape[:2], (480, 640)), [True, True])

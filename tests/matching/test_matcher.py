@@ -188,7 +188,7 @@ def test_the_number_of_threads_is_honoured():
 
 def test_an_unknown_name_lists_the_shipped_ones():
     with pytest.raises(
-        sw.MatcherError, match=r"unknown model 'tiny'; expected base or small, best, or the path"
+        sw.MatcherError, match=r"unknown model 'tiny'; expected base, small, best or the path"
     ):
         Matcher("tiny")
 

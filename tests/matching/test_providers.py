@@ -61,7 +61,7 @@ def test_a_missing_provider_is_reported_with_its_requirements(provider):
         sw.estimate(np.zeros((32, 32, 3), np.uint8), np.zeros((32, 32, 3), np.uint8), provider=provider)
     line = str(caught.value)
     assert line.startswith(f"provider {provider}: expected an ONNX Runtime that includes it, found version ")
-    assert f"{onnxruntime.__version__} with {', '.join(HERE)}; it needs " in line
+    assert f"{onnxruntime.__version__} with {', '.join(HERE)}; the provider needs " in line
     assert {
         "cuda": "then pip install onnxruntime-gpu[cuda,cudnn]",
         "tensorrt": "then pip install onnxruntime-gpu[cuda,cudnn] tensorrt",
@@ -126,7 +126,7 @@ def test_running_out_of_memory_is_not_blamed_on_the_file(tmp_path):
     with pytest.raises(ProviderError, match=r"provider cpu: failed to run vast\.onnx: .*alloc") as caught:
         vast.estimate(*noise())
     line = str(caught.value)
-    assert "use smaller pictures, or fewer processes" in line
+    assert "use smaller pictures, or run fewer processes" in line
     assert "or run it on " not in line
     assert "\n" not in line
 

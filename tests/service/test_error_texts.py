@@ -38,7 +38,7 @@ ERRORS: dict[str, tuple[str, dict[str, str], dict[str, Any]]] = {
         {"focal_px": 500},
     ),
     "rectify: expected at least 40 feature matches that agree on the camera positions, found 0 of 0 "
-    "matches; take pictures with more texture and more overlap; or give a calibration (calib)": (
+    "matches; photograph a scene with more texture and with more overlap; or give a calibration (calib)": (
         "/view",
         {"left": "plain.png", "right": "plain.png"},
         {"rectify": True},
@@ -54,7 +54,10 @@ ERRORS: dict[str, tuple[str, dict[str, str], dict[str, Any]]] = {
     ),
 }
 NOTES: dict[str, tuple[dict[str, str], dict[str, Any]]] = {
-    "the right picture lies 2.0 px lower; rectify the pair (rectify)": (LOWER, {"check": True}),
+    "the right picture is 2.0 px lower than the left one; rectify the pair (rectify)": (
+        LOWER,
+        {"check": True},
+    ),
     "side_by_side, detected from name and content; override it if it is wrong (format)": (
         {"picture": "both.png"},
         {},
