@@ -1,4 +1,4 @@
-"""Entry point of `python -m stereoweave`, through which torchrun starts a training."""
+"""Entry point of `python -m stereoweave`, which torchrun uses to start training."""
 
 import sys
 

@@ -1,6 +1,7 @@
 """Type checks for arguments of the Python interface; each check raises a one-line StereoweaveError.
 
-The functions import NumPy only when called, because the command line's help uses them and must be fast.
+NumPy is imported only inside the functions, because the command line's help imports this module and must be
+fast.
 """
 
 import reprlib
@@ -23,7 +24,7 @@ def check_number(name: str, value: object) -> None:
 
 
 def check_whole_number(name: str, value: object) -> None:
-    """Require an integer that does not exceed the range of a float."""
+    """Require an integer within the range of a float."""
     if not isinstance(value, Integral) or isinstance(value, bool) or not _is_held_by_float(value):
         raise StereoweaveError(f"{name}: expected a whole number, got {describe(value)}")
 
@@ -44,7 +45,7 @@ def check_kind(name: str, value: object, *kinds: type) -> None:
 
 
 def check_array(name: str, value: object, kind: str, dimensions: int) -> None:
-    """Require a plain array with `dimensions` axes and dtype kind "f", "u" or "b"."""
+    """Require a plain array with `dimensions` axes and a dtype of the given kind: "f", "u" or "b"."""
     if not is_plain_array(value) or value.dtype.kind != kind or value.ndim != dimensions:
         raise StereoweaveError(
             f"{name}: expected an array of {_DTYPES[kind]} with {dimensions} axes, got {describe(value)}"

@@ -1,7 +1,7 @@
-"""Errors and notes, and the remedies for them.
+"""Errors and notes, with their remedies.
 
-A remedy names settings by their Python keywords, which each front end translates to its own names: options,
-form fields or labels.
+A remedy names settings by their Python keywords, which each front end translates into its own names: those of
+options, form fields or labels.
 """
 
 import copy
@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-# Maps the Python keyword of a setting to the front end's name for it; None if the front end lacks it.
+# Function that maps a setting's Python keyword to its name in a front end, or to None if it has no name.
 NameOf = Callable[[str], str | None]
 
 
@@ -33,7 +33,7 @@ class Remedy:
     settings: tuple[str, ...] = ()
 
     def format(self, name_of: NameOf) -> str:
-        """Format with the front end's names for settings; return "" if it lacks all of them."""
+        """Return the advice with the front end's names for settings; "" if the front end has none of them."""
         names = [name for name in map(name_of, self.settings) if name]
         if not self.settings:
             return self.text
@@ -51,17 +51,17 @@ class Note:
         return self.format(keyword)
 
     def format(self, name_of: NameOf) -> str:
-        """Format with the front end's names for settings."""
+        """Return the line with the front end's names for the settings."""
         return _with_remedy(self.text, self.remedy, name_of)
 
 
 class StereoweaveError(ValueError):
-    """Invalid input; base class of all errors of this package.
+    """Error for invalid input; base class of all errors in this package.
 
     Args:
         message: Text that says what was expected and what was found.
-        setting: Python keyword of the invalid setting, which starts the error's line.
-        remedy: Advice, which ends the error's line.
+        setting: Python keyword of the invalid setting, whose name begins the line.
+        remedy: Advice at the end of the line.
     """
 
     def __init__(self, message: str, *, setting: str | None = None, remedy: Remedy | None = None) -> None:
@@ -72,23 +72,23 @@ class StereoweaveError(ValueError):
         return self.format(keyword)
 
     def format(self, name_of: NameOf) -> str:
-        """Format as one line with the front end's names for settings."""
+        """Return the error as one line, with the front end's names for the settings."""
         prefix = f"{name_of(self.setting) or self.setting}: " if self.setting else ""
         return prefix + _with_remedy(self.message, self.remedy, name_of)
 
     @classmethod
     def from_error(cls, error: Exception) -> "StereoweaveError":
-        """Return an error of this class with another one's message, setting and remedy."""
+        """Return an error of this class with the message, setting and remedy of another error."""
         if isinstance(error, StereoweaveError):
             return cls(error.message, setting=error.setting, remedy=error.remedy)
         return cls(" ".join(str(error).split()))
 
     def with_prefix(self, text: str) -> "StereoweaveError":
-        """Return a copy, of the same class, whose message starts with text."""
+        """Return a copy of the same class whose message is prefixed with `text`."""
         return self._with_message(text + self.message)
 
     def with_detail(self, text: str) -> "StereoweaveError":
-        """Return a copy of the same class, with text inserted before the remedy."""
+        """Return a copy of the same class with `text` inserted before the remedy."""
         return self._with_message(f"{self.message}; {text}")
 
     def _with_message(self, message: str) -> "StereoweaveError":
@@ -106,7 +106,7 @@ class MatcherError(StereoweaveError):
 
 
 class ProviderError(MatcherError):
-    """Error for a provider that fails during inference, such as out of memory; a retry may succeed."""
+    """Error for a provider's failure during inference, such as lack of memory; a retry may succeed."""
 
 
 class OutputInUseError(StereoweaveError):
@@ -114,7 +114,7 @@ class OutputInUseError(StereoweaveError):
 
 
 def format_error(error: Exception, name_of: NameOf) -> str:
-    """Format any exception in one line, a StereoweaveError with the front end's names for settings."""
+    """Return an error's text; a StereoweaveError's text uses the front end's names for settings."""
     return error.format(name_of) if isinstance(error, StereoweaveError) else str(error)
 
 
@@ -125,21 +125,21 @@ def _with_remedy(text: str, remedy: Remedy | None, name_of: NameOf) -> str:
 
 @contextmanager
 def require_extra(extra: str, what: str) -> Iterator[None]:
-    """Turn a missing library into a StereoweaveError that names the extra to install.
+    """Turn a missing library's import error into a StereoweaveError that names the extra to install.
 
-    `what` says what was expected, such as "a plot needs matplotlib".
+    `what` begins the message, for example with "a plot needs matplotlib".
     """
     try:
         yield
     except ModuleNotFoundError as missing:
         raise StereoweaveError(
-            f"{what}, found no module {missing.name}; install the extra '{extra}': "
-            f"pip install 'stereoweave[{extra}]', from your wheel or your copy of the source"
+            f"{what}, but the module {missing.name} is not installed; install the extra '{extra}' from your "
+            f"wheel or your copy of the source: pip install 'stereoweave[{extra}]'"
         ) from missing
 
 
 def reason(error: Exception) -> str:
-    """Describe what was found instead of a usable file, as the end of "expected ..., found ..."."""
+    """Return what was found instead of a usable file, to complete "expected ..., found ..."."""
     match error:
         case FileNotFoundError():
             return "no such file"

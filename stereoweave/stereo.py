@@ -21,15 +21,15 @@ from stereoweave.arguments import (
 )
 from stereoweave.errors import StereoweaveError
 
-# Limit of cv2.remap, which indexes pixels with 16 bits.
+# Limit of cv2.remap, which indexes pixels with 16-bit integers.
 LONGEST_SIDE_PX = 32_766
 
 # NumPy arrays and PyTorch tensors have no common base class, and only `learn` imports PyTorch.
 ArrayOrTensor = TypeVar("ArrayOrTensor", bound=Any)
 
-# No real camera has larger parameters (px, m or coefficients), and their products would overflow float32.
+# No real camera has larger parameters (px, m or coefficients), and products of such would overflow float32.
 CAMERA_NUMBERS_BELOW = 1e9
-# Code below which the curve is a straight line, which bounds the slope of `DepthCurve.decode`.
+# Below this code, the curve is a straight line, so that the slope of `DepthCurve.decode` is bounded.
 _STRAIGHT_BELOW = 1e-5
 _LARGEST_FITTED_EXPONENT = 8.0
 
@@ -58,7 +58,7 @@ class StereoCamera:
             )
         if not all(abs(value) < CAMERA_NUMBERS_BELOW for value in vars(self).values()):
             raise StereoweaveError(
-                f"a camera's numbers must be finite and below {CAMERA_NUMBERS_BELOW:g}, got {self}"
+                f"camera parameters must be finite with magnitudes below {CAMERA_NUMBERS_BELOW:g}, got {self}"
             )
 
     @classmethod
@@ -78,7 +78,7 @@ class StereoCamera:
             return self.focal_px * self.baseline_m / shifted_px
 
     def disparity_px(self, depth_m: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-        """Return the disparity in pixels, given the depth in metres: the inverse of `depth_m`."""
+        """Return the disparity in pixels for a depth in metres; this is the inverse of `depth_m`."""
         check_numbers("depth_m", depth_m)
         with np.errstate(divide="ignore"):
             return self.focal_px * self.baseline_m / depth_m - self.doffs_px
@@ -86,10 +86,10 @@ class StereoCamera:
 
 @dataclass(frozen=True, kw_only=True)
 class StereoPair:
-    """Rectified left and right images, uint8 RGB of equal size, and their camera if known.
+    """Rectified left and right images, uint8 RGB of the same size, and their camera if known.
 
     left_seen and right_seen, bool [H, W], are False at pixels without content, such as the borders that
-    rectification leaves; None if every pixel has content.
+    rectification leaves; they are None if every pixel has content.
     """
 
     left: UInt8[np.ndarray, "h w 3"]
@@ -104,7 +104,7 @@ class StereoPair:
                 raise StereoweaveError(f"{side} image: expected uint8 RGB [H, W, 3], got {describe(image)}")
             if max(image.shape) > LONGEST_SIDE_PX:
                 raise StereoweaveError(
-                    f"{side} image: expected at most {LONGEST_SIDE_PX} pixels a side, got {_size(image)}; "
+                    f"{side} image: expected at most {LONGEST_SIDE_PX} pixels per side, got {_size(image)}; "
                     "scale it down or crop it"
                 )
         if self.left.shape != self.right.shape:
@@ -137,11 +137,11 @@ class Estimate:
     """Matching result for a pair; every array is [H, W] and finite.
 
     Attributes:
-        disparity_px: float32, of the left view: column x is at x - disparity_px in the right image.
-        right_disparity_px: float32, of the right view: column x is at x + right_disparity_px in the left
-            image.
-        confidence: float32 in 0..1, the estimated probability that disparity_px is within 1 px of the truth.
-        occluded: bool, pixels that only the left camera sees.
+        disparity_px: Disparity of the left view, float32: column x is at x - disparity_px in the right image.
+        right_disparity_px: Disparity of the right view, float32: column x is at x + right_disparity_px in the
+            left image.
+        confidence: Estimated probability, float32 in 0..1, that disparity_px is within 1 px of the truth.
+        occluded: Mask, bool, of the pixels that only the left camera sees.
     """
 
     disparity_px: Float[np.ndarray, "h w"]
@@ -166,7 +166,7 @@ class Estimate:
                 )
         if self.confidence.size and not 0 <= self.confidence.min() <= self.confidence.max() <= 1:
             raise StereoweaveError(
-                f"confidence: expected probabilities, 0 to 1, got {self.confidence.min():g} to "
+                f"confidence: expected probabilities from 0 to 1, got {self.confidence.min():g} to "
                 f"{self.confidence.max():g}"
             )
 
@@ -179,13 +179,13 @@ def check_fits(estimate: Estimate, pair: StereoPair) -> None:
     if found != expected:
         raise StereoweaveError(
             f"estimate: expected the size of the images, {expected[1]}x{expected[0]}, "
-            f"got {found[1]}x{found[0]}; estimate it from these images"
+            f"got {found[1]}x{found[0]}; use an estimate made from these images"
         )
 
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """Synthesized image, uint8 RGB [H, W, 3]; `drawn`, bool [H, W], marks the pixels that a camera saw."""
+    """Synthesised image, uint8 RGB [H, W, 3]; `drawn`, bool [H, W], is True at pixels that a camera saw."""
 
     image: UInt8[np.ndarray, "h w 3"]
     drawn: Bool[np.ndarray, "h w"]
@@ -197,8 +197,9 @@ class Sample:
 
     Attributes:
         left, right: Images, uint8 RGB [H, W, 3].
-        disparity_px, right_disparity_px: True disparities, float32 [H, W], with the signs of `Estimate`.
-        occluded, right_occluded: bool [H, W], pixels that only the camera of that view sees.
+        disparity_px, right_disparity_px: True disparities, float32 [H, W], with the sign convention of
+            `Estimate`.
+        occluded, right_occluded: Masks, bool [H, W], of the pixels that only that view's camera sees.
         camera: The camera, if known.
     """
 
@@ -213,11 +214,11 @@ class Sample:
 
 @dataclass(frozen=True, kw_only=True)
 class DepthCurve:
-    """Depth adjustment of "Fast Depth Estimation for View Synthesis": maps disparity or depth to a code.
+    """Depth adjustment of "Fast Depth Estimation for View Synthesis": map from disparity or depth to a code.
 
-    The code is u^p (equation 3), where u is d / d_max or 1 - z / z_max: 0 is far, 1 is near, and p >= 1 gives
-    near surfaces more of the range. Set max_disparity_px to encode disparity, or max_depth_m to encode depth,
-    but not both.
+    The code is u^p (equation 3), where u is d / d_max or 1 - z / z_max. A code of 0 is far and a code of 1 is
+    near; p >= 1 gives near surfaces more of the range. Set max_disparity_px to encode disparity, or
+    max_depth_m to encode depth, but not both.
 
     There is one deviation: below a code of 1e-5, the curve is a straight line to 0. The slope of the paper's
     x^(1/p) (equation 4) is infinite at 0; here it is at most 1e5 for any p, and 46 for p = 1.5. The code
@@ -246,11 +247,11 @@ class DepthCurve:
             raise StereoweaveError(f"exponent must be finite and at least 1, got {self.exponent}")
 
     def encode(self, values: ArrayOrTensor) -> ArrayOrTensor:
-        """Encode disparity in px or depth in m as a code in 0..1, of the same shape; NaN stays NaN.
+        """Encode disparity in px or depth in m as a code in 0..1 of the same shape; NaN stays NaN.
 
         Args:
-            values: Array or tensor of any shape: disparity in 0..max_disparity_px, or depth above 0 and at
-                most max_depth_m; NaN where unknown.
+            values: Array or tensor of any shape: disparity in 0..max_disparity_px, or depth that is above 0
+                and at most max_depth_m; NaN where unknown.
 
         Raises:
             StereoweaveError: A value is outside the range.
@@ -272,9 +273,10 @@ class DepthCurve:
         return straight * straight.clip(min=_STRAIGHT_BELOW ** (1 / self.exponent)) ** (self.exponent - 1)
 
     def decode(self, code: ArrayOrTensor) -> ArrayOrTensor:
-        """Decode a code in 0..1 to disparity in px or depth in m: the inverse of `encode`.
+        """Decode a code in 0..1 to disparity in px or depth in m; this is the inverse of `encode`.
 
-        Value and gradient are finite on all of [0, 1]. 0 is far (disparity 0 or max_depth_m), 1 is near.
+        The value and its gradient are finite on all of [0, 1]. A code of 0 is far (disparity 0 or
+        max_depth_m), and a code of 1 is near.
         """
         straight = code * code.clip(min=_STRAIGHT_BELOW) ** (1 / self.exponent - 1)
         if self.max_disparity_px is not None:
@@ -283,7 +285,7 @@ class DepthCurve:
 
 
 def fit_exponent(histogram: Real[np.ndarray, " n"]) -> float:
-    """Fit the exponent p of a `DepthCurve`, 1 to 8, to a training set.
+    """Fit the exponent p of a `DepthCurve`, from 1 to 8, to a training set.
 
     The paper initialises p by "curve fitting to the histogram of the training ground truth" and gives no
     details. Here u^p is fitted to the cumulative histogram by least squares at the bin edges. The cumulative
@@ -297,7 +299,8 @@ def fit_exponent(histogram: Real[np.ndarray, " n"]) -> float:
     if histogram.size < 2 or not (histogram >= 0).all() or not 0 < histogram.sum() < math.inf:
         raise StereoweaveError(
             "histogram: expected 2 or more finite counts, none of them negative and not all of them 0, "
-            f"got {histogram.size}, {(histogram < 0).sum()} of them negative, with the sum {histogram.sum()}"
+            f"got {histogram.size} counts, {(histogram < 0).sum()} of them negative, with the sum "
+            f"{histogram.sum()}"
         )
     edges = np.arange(1, histogram.size) / histogram.size
     cumulative = histogram.cumsum()[:-1] / histogram.sum()
@@ -312,8 +315,8 @@ def fit_exponent(histogram: Real[np.ndarray, " n"]) -> float:
 def _refuse(outside: ArrayOrTensor, expected: str) -> None:
     if len(outside) > 0:
         raise StereoweaveError(
-            f"{expected}, NaN where unknown, found {outside[0].item()}; "
-            "raise the maximum, or make such pixels NaN"
+            f"{expected}, or NaN where unknown, found {outside[0].item()}; "
+            "raise the maximum, or set such pixels to NaN"
         )
 
 

@@ -184,10 +184,10 @@ def test_a_set_that_is_all_near_gets_the_largest_exponent():
 @pytest.mark.parametrize(
     ("histogram", "found"),
     [
-        ([], "got 0, 0 of them negative"),
-        ([3], "got 1, "),
+        ([], "got 0 counts, 0 of them negative"),
+        ([3], "got 1 counts, "),
         ([0, 0], "with the sum 0"),
-        ([2, -1], "got 2, 1 of them negative"),
+        ([2, -1], "got 2 counts, 1 of them negative"),
         ([1.0, np.nan], "with the sum nan"),
         ([1.0, np.inf], "with the sum inf"),
     ],

@@ -47,13 +47,13 @@ ERRORS = {
     f"format: expected one of {LAYOUTS}, mpo, jps, found 'diagonal'": lambda: open_pictures(
         PAIR[:1], "diagonal"
     ),
-    "format: expected one picture that holds both views, found two, left.png and right.png; leave it "
-    "out, and give the left one first": lambda: open_pictures(PAIR, "crossed"),
+    "format: expected one picture that holds both views, found two, left.png and right.png; omit this "
+    "setting, and give the left picture first": lambda: open_pictures(PAIR, "crossed"),
     "turned.yml: expected a calibration of rectified pictures, found lenses with distortion; rectify "
     "the pair with it (rectify)": lambda: prepare(PAIR, Request(calibration=Path("turned.yml"))),
-    "metres: expected a baseline in addition to the focal length, found none; give the baseline "
+    "metres: expected a baseline besides the focal length, found none in EXIF; give the baseline "
     "(baseline_m)": (lambda: prepare(PAIR, Request(focal_px=500))),
-    "metres: expected a focal length in EXIF in addition to the baseline, found none; give the focal length "
+    "metres: expected a focal length besides the baseline, found none in EXIF; give the focal length "
     "(focal_px)": lambda: prepare(PAIR, Request(baseline_m=0.1)),
     "rectify: expected at least 40 feature matches that agree on the camera positions, found 0 of 0 "
     "matches; photograph a scene with more texture and with more overlap; or give a calibration "
@@ -72,7 +72,7 @@ ERRORS = {
     "range_px: expected disparities between -64 and 64 px, the width of the pictures, got 70 and 80; omit it "
     "for automatic detection": lambda: sw.estimate(BLACK, BLACK, range_px=(70, 80)),
     "threads: expected a number from 1 to 1024, got 0": lambda: sw.Matcher(threads=0),
-    "position: expected -1.0 to 2.0 (0 is the left camera, 1 the right), got 3": (
+    "position: expected -1.0 to 2.0 (0 is the left camera and 1 the right one), got 3": (
         lambda: sw.synthesize(BLACK, BLACK, 3, threads=1)
     ),
     "expected one kind of output, found none; choose one (depth, depth16, position, layout)": VideoJob,

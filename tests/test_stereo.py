@@ -11,7 +11,7 @@ CAMERA = {"focal_px": 1000.0, "baseline_m": 0.1, "cx_px": 320.0, "cy_px": 240.0}
 
 def test_a_pair_longer_than_the_limit_is_refused_in_one_line():
     image = np.zeros((32_767, 32, 3), np.uint8)
-    with pytest.raises(StereoweaveError, match="at most 32766 pixels a side, got 32x32767"):
+    with pytest.raises(StereoweaveError, match="at most 32766 pixels per side, got 32x32767"):
         StereoPair(left=image, right=image)
 
 

@@ -18,19 +18,19 @@ Frames = Iterator[UInt8[np.ndarray, "h w 3"]]
 
 
 def write_animation(path: str | Path, frames: Iterable[UInt8[np.ndarray, "h w 3"]], frame_ms: int) -> None:
-    """Write frames as an animation, in the format given by the file's ending: .mp4, .gif or .webp.
+    """Write frames as an animation, in the format given by the file extension: .mp4, .gif or .webp.
 
     GIF and WebP files repeat forever; all their frames are in memory while they are written. An MP4 file
     plays once and is written frame by frame; an odd width or height is made even by repeating the last column
     or row.
 
     Args:
-        path: The file, written atomically.
+        path: Output file, which is written atomically.
         frames: uint8 RGB [H, W, 3]; at least one, all of the same size.
         frame_ms: Duration of a frame. GIF rounds it to 10 ms.
 
     Raises:
-        StereoweaveError: if the ending is none of these, there are no frames, their sizes differ, PyAV is
+        StereoweaveError: The extension is none of these, there are no frames, their sizes differ, PyAV is
             missing, or the disk is full.
     """
     write = _KINDS[check_animation_ending(path)]
@@ -40,16 +40,15 @@ def write_animation(path: str | Path, frames: Iterable[UInt8[np.ndarray, "h w 3"
 
 
 def check_animation_ending(path: str | Path) -> str:
-    """Return the ending of an animation's path in lower case.
+    """Return an animation's file extension in lower case.
 
     Raises:
-        StereoweaveError: if no animation format has this ending, or it is .mp4 and PyAV is missing.
+        StereoweaveError: No animation format has this extension, or it is .mp4 and PyAV is missing.
     """
     ending = Path(path).suffix.lower()
     if ending not in _KINDS:
         raise StereoweaveError(
-            f"{path}: expected one of the animation file endings {', '.join(_KINDS)}, "
-            f"found {Path(path).suffix!r}"
+            f"{path}: expected an animation file extension ({', '.join(_KINDS)}), found {Path(path).suffix!r}"
         )
     if ending == ".mp4":
         with require_video_extra("an MP4 file"):
@@ -59,27 +58,27 @@ def check_animation_ending(path: str | Path) -> str:
 
 @contextmanager
 def require_video_extra(what: str) -> Iterator[None]:
-    """Turn the import error of a missing PyAV into one that names the extra to install."""
+    """Turn the import error for a missing PyAV into an error that names the extra to install."""
     with require_extra("video", f"{what} needs PyAV"):
         yield
 
 
 def _check_sizes(frames: Iterable[UInt8[np.ndarray, "h w 3"]]) -> Frames:
-    """Check the size of each frame against the first one's when the frame is rendered.
+    """Check the size of each frame against the first frame's size as the frames are rendered.
 
     The first frame is rendered at once, so that its errors are raised before a file is created.
     """
     coming = iter(frames)
     first = next(coming, None)
     if first is None:
-        raise StereoweaveError("frames: expected one or more, found none")
+        raise StereoweaveError("frames: expected at least one frame, found none")
     return chain([first], (_check_size(first, frame) for frame in coming))
 
 
 def _check_size(first: UInt8[np.ndarray, "h w 3"], frame: UInt8[np.ndarray, "h2 w2 3"]) -> np.ndarray:
     if frame.shape != first.shape:
         raise StereoweaveError(
-            f"frames: expected all to have the same size, found {first.shape[1]}x{first.shape[0]} "
+            f"frames: expected frames of the same size, found {first.shape[1]}x{first.shape[0]} "
             f"and {frame.shape[1]}x{frame.shape[0]}"
         )
     return frame
@@ -95,7 +94,7 @@ def _write_mp4(path: Path, frames: Frames, frame_ms: int) -> None:
         context = stream.codec_context
         context.height, context.width = first.shape[:2]
         context.pix_fmt = "yuv420p"  # the only format that every player supports
-        # Stored in the file: without these tags, players guess them from the size and shift the colours.
+        # Without these tags in the file, players guess the colour space from the size, and colours shift.
         context.colorspace, context.color_range = Colorspace.ITU709, ColorRange.MPEG
         context.color_primaries, context.color_trc = ColorPrimaries.BT709, ColorTrc.BT709
         for frame in chain([first], map(_pad_to_even, frames)):
@@ -113,10 +112,10 @@ def _pad_to_even(frame: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 
 
 
 def _write_gif(path: Path, frames: Frames, frame_ms: int) -> None:
-    """Write a GIF with the first frame's palette for all frames: separate palettes would cause flicker."""
+    """Write a GIF with the first frame's palette for all frames, as separate palettes would cause flicker."""
     pictures = (Image.fromarray(frame) for frame in frames)
     first = next(pictures)
-    # Pillow's most accurate and fastest method: 39.1 dB on the example; MEDIANCUT has 35.2 dB, both dithered.
+    # Pillow's most accurate and fastest method: 39.1 dB on the example; MEDIANCUT has 35.2 dB; both dithered.
     palette = first.quantize(256, method=Image.Quantize.FASTOCTREE)
     _save(path, "GIF", (picture.quantize(palette=palette) for picture in chain([first], pictures)), frame_ms)
 

@@ -19,17 +19,17 @@ def as_rgb(image: object, name: str = "image") -> UInt8[np.ndarray, "h w 3"]:
 
     Grey is repeated in all three channels, alpha is dropped, 16-bit values are reduced to their upper 8 bits,
     and floats in 0..1 are scaled and rounded. The channels are the last axis if its length is 1, 3 or 4, else
-    the first; so [3, W, 3] is 3 rows of W pixels. A batch of one image loses its leading axis.
+    the first axis, so [3, W, 3] means 3 rows of W pixels. A batch of one image loses its leading axis.
 
     Channels are taken to be RGB: reverse OpenCV's BGR images with `image[..., ::-1]` first. The EXIF
     orientation of a PIL image is ignored: apply `PIL.ImageOps.exif_transpose` first.
 
     Args:
         image: NumPy array, PIL image of any colour mode, or PyTorch tensor on any device.
-        name: Name of the image in errors.
+        name: Name of the image in error messages.
 
     Raises:
-        StereoweaveError: if the type, shape or dtype is unsupported, or a float is outside 0..1.
+        StereoweaveError: The type, shape or dtype is unsupported, or a float is outside 0..1.
     """
     if isinstance(image, Image.Image):
         image = _convert_pil(image)

@@ -1,4 +1,4 @@
-"""Decoding of picture files with their metadata.
+"""Decoding of picture files and their metadata.
 
 All parts of the package decode pictures here, so that formats, limits, colours, orientation and errors are
 the same everywhere.
@@ -25,11 +25,12 @@ from stereoweave.stereo import LONGEST_SIDE_PX
 # file's header, before memory is allocated.
 MOST_PIXELS = 65_000_000
 A_PICTURE = "a picture (PNG, JPEG, TIFF or the like)"
-# File name endings for finding pictures in a folder; the format of a file is detected from its content.
+# File extensions by which pictures in a folder are found; a file's format is detected from its content.
 ENDINGS = frozenset(
     {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp", ".gif", ".jp2", ".pgm", ".ppm", ".avif"}
 )
-# Not all of Pillow's formats: PostScript, for example, would run as a program. JPEG includes MPO and JPS.
+# Not all of Pillow's formats: a PostScript file, for example, would run as a program. JPEG includes MPO and
+# JPS.
 _KINDS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "GIF", "PPM", "AVIF", "JPEG2000")
 _RAW_ENDINGS = {
     *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dng", ".erf", ".iiq", ".kdc", ".mrw", ".nef", ".nrw", ".orf"),
@@ -40,7 +41,7 @@ _HEIF_BRANDS = {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b
 _AVIF_BRANDS = {b"avif", b"avis"}
 _MP_ENTRIES, _DISPARITY = 0xB002, "Multi-Frame Image: (Disparity)"
 _LONGEST_WORDS = 100
-# The mode to which a picture is converted before its ICC profile is applied, by the picture's own mode.
+# Modes to which pictures are converted before their ICC profiles are applied, by the pictures' own modes.
 _PROFILED = {"RGB": "RGB", "RGBA": "RGB", "P": "RGB", "L": "L", "LA": "L", "CMYK": "CMYK"}
 
 # Pillow logs errors before raising them, and Python writes unhandled log records to stderr.
@@ -65,7 +66,7 @@ def open_picture(path: Path, *, views: int = 1, expected: str = A_PICTURE) -> It
     """Open a picture with up to `views` views and check its format and size, without decoding it.
 
     Raises:
-        FormatError: if the format or the size is unsupported. Damaged content is detected by decoding.
+        FormatError: The format or the size is unsupported. Damaged content is not detected before decoding.
     """
     check_regular(path, expected)
     with _decoding(path, expected), path.open("rb") as file:
@@ -88,7 +89,7 @@ def read_picture(path: Path) -> DecodedPicture:
 def decode(path: Path, picture: Image.Image) -> DecodedPicture:
     """Decode an opened picture, or its current frame."""
     with _decoding(path):
-        # Before reading the tags: loading turns a TIFF upright and updates its orientation tag.
+        # Load before reading the tags, because loading turns a TIFF upright and updates its orientation tag.
         picture.load()
     tags = exif.read_tags(picture)
     if picture.mode.startswith(("I", "F")):
@@ -99,14 +100,14 @@ def decode(path: Path, picture: Image.Image) -> DecodedPicture:
 
 
 def decode_values(path: str | Path, picture: Image.Image) -> Shaped[np.ndarray, "h w *channels"]:
-    """Decode the stored values of an opened picture, such as a measurement or a mask."""
+    """Decode the stored values of an opened picture, such as measurements or a mask."""
     with _decoding(path):
         picture.load()
         return np.array(picture)
 
 
 def decode_packed_values(name: str, content: bytes) -> Shaped[np.ndarray, "h w *channels"]:
-    """Decode the stored values of a picture embedded in another file; errors call it `name`."""
+    """Decode the stored values of a picture embedded in another file; error messages call it `name`."""
     with _decoding(name):
         picture = _open(name, io.BytesIO(content), 1)
     check_size(name, picture.size)
@@ -114,7 +115,7 @@ def decode_packed_values(name: str, content: bytes) -> Shaped[np.ndarray, "h w *
 
 
 def check_regular(path: Path, expected: str) -> None:
-    """Raise a FormatError unless the path is a regular file: a pipe may block, a device may be endless."""
+    """Raise a FormatError unless the path is a regular file; pipes may block, and devices may be endless."""
     try:
         mode = path.stat().st_mode
     except (OSError, ValueError) as error:  # ValueError: a name with a zero byte
@@ -125,7 +126,7 @@ def check_regular(path: Path, expected: str) -> None:
 
 
 def check_size(path: str | Path, size_px: tuple[int, int], *, views: int = 1) -> None:
-    """Raise a FormatError if width, height or the number of pixels exceeds the limit."""
+    """Raise a FormatError if the width, the height or the number of pixels exceeds its limit."""
     width_px, height_px = size_px
     if width_px * height_px > views * MOST_PIXELS:
         raise FormatError(
@@ -133,18 +134,18 @@ def check_size(path: str | Path, size_px: tuple[int, int], *, views: int = 1) ->
         )
     if max(size_px) > views * LONGEST_SIDE_PX:
         raise FormatError(
-            f"{path}: expected at most {views * LONGEST_SIDE_PX} pixels a side, "
+            f"{path}: expected at most {views * LONGEST_SIDE_PX} pixels per side, "
             f"found {width_px}x{height_px}; scale it down or crop it"
         )
 
 
 @contextmanager
 def _decoding(path: str | Path, expected: str = A_PICTURE) -> Iterator[None]:
-    """Turn any exception of Pillow into a one-line FormatError.
+    """Turn any exception from Pillow into a one-line FormatError.
 
     Pillow's decoders raise undocumented exceptions for damaged files, such as IndexError, KeyError,
-    TypeError, struct.error and zlib.error; a list would never be complete. Wrap calls to Pillow only: bugs in
-    this package must not be reported as damaged files.
+    TypeError, struct.error and zlib.error; a list of them would never be complete. Wrap only calls to Pillow,
+    because bugs in this package must not be reported as damaged files.
     """
     try:
         # Pillow warns about odd tags before it fails; the error below is enough.
@@ -153,7 +154,7 @@ def _decoding(path: str | Path, expected: str = A_PICTURE) -> Iterator[None]:
     except FormatError:
         raise
     except UnidentifiedImageError as error:
-        raise FormatError(f"{path}: expected {expected}, found something else") from error
+        raise FormatError(f"{path}: expected {expected}, found another type of file") from error
     except Exception as error:
         raise FormatError(f"{path}: expected {expected}, found {reason(error)}") from error
 
@@ -176,7 +177,7 @@ def _refuse_by_name(path: Path, head: bytes) -> None:
     ending = path.suffix.lower()
     if ending in _RAW_ENDINGS:
         raise FormatError(
-            f"{path}: expected {A_PICTURE}, found a camera's raw file; convert it to one of these first"
+            f"{path}: expected {A_PICTURE}, found a camera raw file; convert it to one of these formats first"
         )
     brands = {head[start : start + 4] for start in (8, *range(16, 64, 4))} if head[4:8] == b"ftyp" else set()
     if brands & _AVIF_BRANDS:
@@ -187,10 +188,11 @@ def _refuse_by_name(path: Path, head: bytes) -> None:
     elif brands & _HEIF_BRANDS:
         raise FormatError(
             f"{path}: expected {A_PICTURE}, found HEIC, the format of spatial photographs, "
-            "which is unsupported; export it as two JPEG files, or as one with both views side by side"
+            "which is unsupported; export it as two JPEG files, or as one JPEG file with both views side by "
+            "side"
         )
     elif brands or ending in _VIDEO_ENDINGS:
-        raise FormatError(f"{path}: expected {A_PICTURE}, found a video; 'stereoweave video' reads videos")
+        raise FormatError(f"{path}: expected {A_PICTURE}, found a video; use 'stereoweave video'")
 
 
 def _refuse_by_content(path: Path, picture: Any) -> None:
@@ -208,7 +210,7 @@ def _refuse_by_content(path: Path, picture: Any) -> None:
         if count > 1:
             raise FormatError(
                 f"{path}: expected one picture, found an animation of {count} frames; "
-                "save its two views as pictures"
+                "save its two views as separate pictures"
             )
 
 
@@ -218,8 +220,8 @@ def _to_eight_bits(path: Path, picture: Image.Image) -> Image.Image:
         values = np.asarray(picture)
     if picture.mode == "F" or values.min() < 0 or values.max() > 65535:
         raise FormatError(
-            f"{path}: expected {A_PICTURE}, found one that cannot be read (more than 16 bits a channel or "
-            f"values below 0, mode {picture.mode})"
+            f"{path}: expected {A_PICTURE}, found one with more than 16 bits per channel or with negative "
+            f"values (mode {picture.mode}), which cannot be read"
         )
     # Keep the upper byte, as Pillow does for 16-bit colour; a 32-bit file may hold 8-bit values.
     bits = 8 if picture.mode != "I" or values.max() > 255 else 0
@@ -227,7 +229,7 @@ def _to_eight_bits(path: Path, picture: Image.Image) -> Image.Image:
 
 
 def _convert_to_srgb(picture: Image.Image) -> tuple[Image.Image, str | None]:
-    """Convert a picture to sRGB. Returns it and a note if it had another or a damaged colour profile."""
+    """Convert a picture to sRGB. Returns it, with a note if its colour profile was damaged or not sRGB."""
     profile, mode = picture.info.get("icc_profile"), _PROFILED.get(picture.mode)
     if not profile or mode is None:
         return picture, None
@@ -246,7 +248,7 @@ def _convert_to_srgb(picture: Image.Image) -> tuple[Image.Image, str | None]:
             outputMode="RGB",
             flags=ImageCms.Flags.BLACKPOINTCOMPENSATION,
         )
-    except Exception as error:  # a damaged profile may raise any type, as in `_decoding`
+    except Exception as error:  # a damaged profile may raise any exception, as in `_decoding`
         return (
             picture,
             f"the colour profile cannot be used, so colours are taken to be sRGB ({_clean_text(str(error))})",
@@ -255,12 +257,12 @@ def _convert_to_srgb(picture: Image.Image) -> tuple[Image.Image, str | None]:
 
 
 def _clean_text(text: str) -> str:
-    """Return text from a file in a form that is safe to show within a line."""
+    """Return text from a file in a form that is safe to show on one line."""
     return "".join(filter(str.isprintable, " ".join(text.split())))[:_LONGEST_WORDS]
 
 
 def find_view_frames(path: Path, picture: Any) -> list[int]:
-    """Return the indices of the two frames of an MPO file that are its views; empty if it has one view."""
+    """Return the indices of an MPO file's two frames that hold its views; empty if it has only one view."""
     if picture.format != "MPO":
         return []
     with _decoding(path):
@@ -295,8 +297,8 @@ def _seek(path: Path, picture: Image.Image, index: int) -> None:
     try:
         with warnings.catch_warnings(action="ignore"):
             picture.seek(index)
-    except Exception as error:  # a damaged file may raise any type, as in `_decoding`
+    except Exception as error:  # a damaged file may raise any exception, as in `_decoding`
         raise FormatError(
-            f"{path}: expected an undamaged MPO file, found picture {index + 1} truncated or damaged "
+            f"{path}: expected an undamaged MPO file, found that picture {index + 1} is truncated or damaged "
             f"({_clean_text(str(error))})"
         ) from error

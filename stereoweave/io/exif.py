@@ -80,7 +80,7 @@ def read_viewpoint(tags: Tags) -> int:
 def read_lens(tags: Tags, width_px: int, height_px: int) -> Lens | None:
     """Return the focal length and the baseline for views of this size; None if the tags have neither.
 
-    The views must show the camera's full image, at any scale: for a crop, the focal length would be wrong.
+    The views must show the camera's full image, at any scale; for a crop, the focal length would be wrong.
     """
     lens = Lens(focal_px=_find_focal_px(tags, width_px, height_px), baseline_m=_find_baseline_m(tags))
     return None if lens == Lens() else lens
@@ -90,7 +90,7 @@ def _read_exif_tags(picture: Image.Image) -> dict[int, Any]:
     try:
         tags = picture.getexif()
         return dict(tags) | dict(tags.get_ifd(IFD.Exif))
-    except Exception:  # damaged tags may raise any type, as in `decoding._decoding`
+    except Exception:  # damaged tags may raise any exception, as in `decoding._decoding`
         return {}
 
 
@@ -105,7 +105,7 @@ def _read_multi_picture_tags(content: bytes) -> dict[int, Any]:
                 file.seek(directory.next)
                 directory.load(file)
                 tags |= dict(directory)
-    except Exception:  # damaged tags may raise any type
+    except Exception:  # damaged tags may raise any exception
         return tags
     if getattr(tags.get(_BASELINE), "numerator", _UNKNOWN) == _UNKNOWN:
         tags.pop(_BASELINE, None)

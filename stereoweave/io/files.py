@@ -14,7 +14,7 @@ from stereoweave.errors import FormatError, StereoweaveError, reason
 MOST_SMALL_BYTES = 256 * 1024
 # Names of the temporary files of `replacing`.
 _TEMPORARY = re.compile(r"\..*-[0-9a-f]{8}(\.\w+)?")
-# Errors that libraries raise for damaged files: OverflowError for infinite sizes, RuntimeError (as
+# Errors that libraries raise for damaged files, such as OverflowError for infinite sizes and RuntimeError (as
 # RecursionError) for deeply nested JSON.
 _UNREADABLE = OSError, ValueError, OverflowError, SyntaxError, RuntimeError
 
@@ -39,16 +39,14 @@ def read_small(path: str | Path) -> bytes:
 
 
 def make_folder(path: str | Path) -> Path:
-    """Make a folder and check at once that it is writable, so that a long run does not fail at its end."""
+    """Create a folder and check at once that it is writable, so that a long run does not fail at its end."""
     folder = Path(path)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             return folder
     except OSError as error:
-        raise StereoweaveError(
-            f"{path}: expected a folder that can be written, found {reason(error)}"
-        ) from error
+        raise StereoweaveError(f"{path}: expected a writable folder, found {reason(error)}") from error
 
 
 def make_parent_folder(*files: Path) -> Path:
@@ -59,8 +57,8 @@ def make_parent_folder(*files: Path) -> Path:
     """
     for file in files:
         if file.is_dir():
-            raise StereoweaveError(f"{file}: expected a file that can be written, found a folder")
-    # A dangling link counts as existing, because no folder can be made in its place.
+            raise StereoweaveError(f"{file}: expected a writable file, found a folder")
+    # A dangling link counts as existing, because no folder can be created in its place.
     return make_folder(next(path for path in files[0].parents if path.exists() or path.is_symlink()))
 
 
@@ -79,8 +77,8 @@ def reading(path: str | Path, expected: str) -> Iterator[None]:
 def replacing(path: str | Path) -> Iterator[Path]:
     """Write a file atomically: yield a temporary path, whose file replaces `path` at the end.
 
-    The temporary file is in the folder of `path`, has the same ending, and is removed after an error. Missing
-    folders are made.
+    The temporary file is in the folder of `path`, has the same extension, and is removed after an error.
+    Missing folders are created.
 
     Raises:
         StereoweaveError: The folder or the file cannot be written.
@@ -91,15 +89,13 @@ def replacing(path: str | Path) -> Iterator[Path]:
         yield temporary
         temporary.replace(target)
     except OSError as error:
-        raise StereoweaveError(
-            f"{path}: expected a file that can be written, found {reason(error)}"
-        ) from error
+        raise StereoweaveError(f"{path}: expected a writable file, found {reason(error)}") from error
     finally:
         temporary.unlink(missing_ok=True)
 
 
 def is_leftover(path: Path) -> bool:
-    """Return whether a file has the name of a temporary file of `replacing`, left by a killed program."""
+    """Return whether a file has the name of a temporary file of `replacing`, which a killed program left."""
     return _TEMPORARY.fullmatch(path.name) is not None
 
 

@@ -20,7 +20,7 @@ _LONGEST_PFM_HEADER = 256
 
 
 class RangeError(StereoweaveError):
-    """Disparity outside the range of a 16-bit PNG."""
+    """Error for a disparity outside the range of a 16-bit PNG."""
 
 
 def read_pfm(path: str | Path) -> Float32[np.ndarray, "h w"]:
@@ -30,9 +30,8 @@ def read_pfm(path: str | Path) -> Float32[np.ndarray, "h w"]:
     little-endian values.
 
     Raises:
-        FormatError: The file is missing, is of another format or has three channels ('PF'). Or it has no
-            pixels or more than `read_image` accepts, an invalid scale, or a length that contradicts its
-            header.
+        FormatError: The file is missing, has another format, three channels ('PF'), no pixels, more pixels
+            than `read_image` accepts, an invalid scale, or a length that contradicts its header.
     """
     check_regular(Path(path), "a PFM file")
     with reading(path, "a PFM file"), Path(path).open("rb") as file:
@@ -49,7 +48,7 @@ def read_pfm(path: str | Path) -> Float32[np.ndarray, "h w"]:
 
 
 def _parse_pfm_header(path: str | Path, content: bytes) -> tuple[tuple[int, int], str, int]:
-    """Parse a PFM header. Returns width and height, NumPy's byte order, and the offset of the values."""
+    """Parse a PFM header. Returns the size (width, height), NumPy's byte order and the values' offset."""
     header = _PFM_HEADER.match(content)
     if header is None:
         raise FormatError(
@@ -97,7 +96,7 @@ def read_pixels(path: str | Path, *modes: str) -> Shaped[np.ndarray, "h w *chann
     expected = f"a picture of mode {' or '.join(modes)}"
     with open_picture(Path(path), expected=expected) as picture:
         if picture.mode not in modes:
-            raise FormatError(f"{path}: expected {expected}, found {picture.format} of mode {picture.mode}")
+            raise FormatError(f"{path}: expected {expected}, found mode {picture.mode} ({picture.format})")
         return decode_values(path, picture)
 
 
@@ -106,7 +105,7 @@ def read_disparity_png(path: str | Path) -> Float32[np.ndarray, "h w"]:
     expected = "a 16-bit grey PNG of disparity * 256"
     with open_picture(Path(path), expected=expected) as picture:
         if not picture.mode.startswith("I"):
-            raise FormatError(f"{path}: expected {expected}, found {picture.format} of mode {picture.mode}")
+            raise FormatError(f"{path}: expected {expected}, found mode {picture.mode} ({picture.format})")
         steps = decode_values(path, picture)
     return np.where(steps > 0, steps / 256, np.nan).astype(np.float32)
 
@@ -114,7 +113,7 @@ def read_disparity_png(path: str | Path) -> Float32[np.ndarray, "h w"]:
 def write_disparity_png(path: str | Path, disparity_px: Float[np.ndarray, "h w"]) -> None:
     """Write disparity as a 16-bit PNG of px * 256 (KITTI's format); NaN and infinity become 0 (unknown).
 
-    Known disparities are written as at least 1/256 px, so that none becomes unknown.
+    Known disparities are written as at least 1/256 px, so that none of them becomes unknown.
 
     Raises:
         RangeError: A known value is below 0 or above 255.99 px; nothing is written.

@@ -1,6 +1,6 @@
 """Lock that lets only one command at a time write to an output.
 
-The operating system releases the lock when the process ends, even if the process is killed.
+The operating system releases the lock when the process exits, even if it is killed.
 """
 
 import errno
@@ -14,7 +14,8 @@ from filelock import FileLock, Timeout
 from stereoweave.errors import OutputInUseError, StereoweaveError
 from stereoweave.io.files import make_folder
 
-# Errors of network file systems without locks; they differ between systems. On Linux the last two are equal.
+# Errors of network file systems without locks, which depend on the operating system. On Linux, the last two
+# are equal.
 _NO_LOCKS = {errno.ENOSYS, errno.ENOLCK, errno.EINVAL, errno.EOPNOTSUPP, errno.ENOTSUP}
 
 
@@ -23,17 +24,17 @@ def lock_output(output: Path, before_waiting: Callable[[], None] | None = None) 
     """Lock an output against other processes, even those that reach it by another path.
 
     The lock file, `.lock` in a folder or `.NAME.lock` beside a file, is removed at the end. A killed process
-    leaves it behind, unlocked; the next process reuses and removes it. A disk without locks gives no
-    protection.
+    leaves the file behind, unlocked; the next process reuses and removes it. There is no protection on a disk
+    that does not support locks.
 
     Args:
         output: An existing folder, or a file, whose folder is created if it is missing.
-        before_waiting: Called before waiting for another process to release the lock; without it, a locked
-            output is an error.
+        before_waiting: Function to call before waiting for another process to release the lock; if it is
+            None, a locked output is an error.
 
     Raises:
-        OutputInUseError: if another process has the lock and `before_waiting` is None.
-        StereoweaveError: if the lock file cannot be written.
+        OutputInUseError: Another process has the lock, and `before_waiting` is None.
+        StereoweaveError: The lock file cannot be written.
     """
     file = _lock_file(Path(os.path.realpath(output)))
     # No soft lock: its file would stay locked after a kill.
@@ -42,14 +43,14 @@ def lock_output(output: Path, before_waiting: Callable[[], None] | None = None) 
         _acquire(lock, before_waiting)
     except Timeout as error:
         raise OutputInUseError(
-            f"{output}: expected an output that no other command writes to, found one that is in use; "
-            "wait for the other command to end, or choose another output"
+            f"{output}: expected an output to which no other command is writing, found one that is in use; "
+            "wait for the other command to finish, or choose another output"
         ) from error
     except OSError as error:
         if error.errno not in _NO_LOCKS:
             remedy = "; remove it" if isinstance(error, IsADirectoryError | PermissionError) else ""
             raise StereoweaveError(
-                f"{file}: expected a file that can be written, found {str(error.strerror).lower()}{remedy}"
+                f"{file}: expected a writable file, found {str(error.strerror).lower()}{remedy}"
             ) from error
     try:
         yield

@@ -1,4 +1,4 @@
-"""Claims on output folders: a JSON description of a folder's run, which other runs check before they write.
+"""Claims on output folders: JSON descriptions of the folders' runs, which other runs check before they write.
 
 The functions take and return the description's text, so the folder may be on a disk or in a store.
 """
@@ -12,20 +12,20 @@ from stereoweave.errors import FormatError, StereoweaveError
 
 
 def describe_run(facts: Mapping[str, Any]) -> str:
-    """Return a run's facts as the JSON text of a description, which `parse_description` reads."""
+    """Return a run's metadata as the JSON text of a description, which `parse_description` reads."""
     return json.dumps(facts, indent=1, default=str) + "\n"
 
 
 def parse_description(place: str | Path, text: str, expected: str) -> dict[str, Any]:
-    """Parse a description. Returns the run's facts.
+    """Parse a description. Returns the run's metadata.
 
     Args:
-        place: Path or URL of the description, for errors.
+        place: Path or URL of the description, for error messages.
         text: Content of the description.
-        expected: Name of the description in errors, such as "the description of a batch".
+        expected: Name of the description in error messages, such as "the description of a batch".
 
     Raises:
-        FormatError: if the text is not a JSON object.
+        FormatError: The text is not a JSON object.
     """
     try:
         facts = json.loads(text)
@@ -40,12 +40,12 @@ def check_claim(place: str | Path, facts: Mapping[str, Any], found: Mapping[str,
     """Check that a folder has not been claimed by a different run.
 
     Args:
-        place: Path or URL of the folder's description, for the error.
-        facts: This run's facts, as passed to `describe_run`.
-        found: The facts in the folder's description.
+        place: Path or URL of the folder's description, for the error message.
+        facts: This run's metadata, as passed to `describe_run`.
+        found: The metadata in the folder's description.
 
     Raises:
-        StereoweaveError: if any fact differs; the error names the first one.
+        StereoweaveError: The metadata is different; the error names the first entry that differs.
     """
     expected = json.loads(describe_run(facts))  # JSON turns tuples into lists
     for name in expected | dict(found):
@@ -60,12 +60,14 @@ def check_unclaimed(folder: str | Path, file: str, others: Iterable[str]) -> Non
     """Check that a folder without a description has no files.
 
     Args:
-        folder: Path or URL, for the error.
+        folder: Path or URL of the folder, for the error message.
         file: Name of the missing description.
         others: Names of the files in the folder.
 
     Raises:
-        StereoweaveError: if the folder has any file.
+        StereoweaveError: The folder contains a file.
     """
     if other := min(others, default=None):
-        raise StereoweaveError(f"{folder}: expected a new folder, or one with a {file}, found {other} in it")
+        raise StereoweaveError(
+            f"{folder}: expected an empty folder or one with a {file}, found one with {other}"
+        )

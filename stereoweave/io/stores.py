@@ -1,4 +1,4 @@
-"""One interface to folders on a disk and in object stores: s3://, gs://, az:// and abfs:// through fsspec.
+"""One interface to folders on a disk and in object stores (s3://, gs://, az:// and abfs:// through fsspec).
 
 Endpoint, region and keys come from the environment and the provider's own files, such as AWS_ENDPOINT_URL and
 ~/.aws/credentials. The store's library retries requests that fail with "slow down" or a server error.
@@ -22,7 +22,14 @@ if TYPE_CHECKING:
 
 
 class _Kind(NamedTuple):
-    """A kind of object store: its library, environment variables for keys and endpoint, library settings."""
+    """A kind of object store.
+
+    Attributes:
+        library: Name of the library.
+        keys: Environment variables for the keys.
+        endpoint: Environment variable for the endpoint.
+        settings: Settings of the library.
+    """
 
     library: str
     keys: str
@@ -45,7 +52,7 @@ _KINDS = {
     "az": _AZURE,
     "abfs": _AZURE,
 }
-# Retries may take minutes in all: acceptable during a run, not at its start.
+# Retries may take minutes in total, which is acceptable during a run but not at its start.
 _ANSWER_S = 15.0
 _NO_KEYS = {
     *("NoCredentialsError", "PartialCredentialsError", "CredentialRetrievalError", "ProfileNotFound"),
@@ -55,12 +62,12 @@ _UNREACHABLE = {
     *("EndpointConnectionError", "HTTPClientError", "ConnectionError", "ClientConnectionError"),
     *("ServiceRequestError", "ServiceResponseError", "TimeoutError", "TransportError"),
 }
-# Metadata that changes with a file's content; the first one that a store reports is used.
+# Metadata that changes with a file's content; the first entry that a store reports is used.
 _VERSIONS = ("ETag", "etag", "md5Hash", "updated", "last_modified")
 
 
 class StoredFile(NamedTuple):
-    """A file in a store: path relative to the folder, separated by "/", size, and version of the content."""
+    """A file in a store: path relative to the folder, separated by "/", size, and version of its content."""
 
     path: str
     size_bytes: int
@@ -74,8 +81,8 @@ class Store(Protocol):
     Paths are relative to the folder and separated by "/".
 
     Raises:
-        StereoweaveError: by every method, if the folder is unreachable, the file is missing, or access is
-            denied.
+        StereoweaveError: The folder is unreachable, the file is missing, or access is denied. Every method
+            may raise it.
     """
 
     @property
@@ -85,11 +92,11 @@ class Store(Protocol):
 
     @property
     def folder(self) -> Path | None:
-        """Path of a folder on a disk, where files need neither `fetch` nor `put`; None in an object store."""
+        """Path of a folder on a disk, where files need no `fetch` and no `put`; None for object stores."""
         ...
 
     def check_source(self) -> None:
-        """Raise a StereoweaveError if the folder is missing, unreachable or cannot be listed."""
+        """Raise a StereoweaveError if the folder is missing, is unreachable or cannot be listed."""
         ...
 
     def check_destination(self) -> None:
@@ -97,7 +104,7 @@ class Store(Protocol):
         ...
 
     def files(self, below: str = "") -> Iterator[StoredFile]:
-        """List the files below the folder, or below one of its subfolders, without hidden ones.
+        """List the files below the folder, or below one of its subfolders, except hidden files.
 
         A missing folder has no files. On a disk and in s3:// the listing is lazy; the other stores' libraries
         list all files before they return the first one.
@@ -105,7 +112,7 @@ class Store(Protocol):
         ...
 
     def fetch(self, path: str, into: Path) -> Path:
-        """Return a local path of the file: the file itself if it is on a disk, else a copy at `into`/path."""
+        """Return a local path of the file: its own path on a disk, else the path of a copy, `into`/path."""
         ...
 
     def put(self, file: Path, path: str) -> None:
@@ -137,7 +144,7 @@ def store_at(place: str | Path) -> Store:
     """Return the store of a path or URL, without connecting to it.
 
     Raises:
-        StereoweaveError: if the protocol is unknown, its library is missing, or the URL has no bucket.
+        StereoweaveError: The protocol is unknown, its library is missing, or the URL has no bucket.
     """
     url = _URL.fullmatch(str(place))
     if url is None:
@@ -153,7 +160,7 @@ def store_at(place: str | Path) -> Store:
     if not path.strip("/") or path.startswith("/"):
         raise StereoweaveError(f"{place}: expected {protocol}://bucket/folder, found no bucket")
     library = _KINDS[protocol].library
-    with require_extra("cluster", f"{place}: expected the library {library}"):
+    with require_extra("cluster", f"{place}: {protocol}:// needs the library {library}"):
         importlib.import_module(library)
     return ObjectStore(f"{protocol}://{path.rstrip('/')}")
 
@@ -199,7 +206,7 @@ class DiskStore:
             shutil.copyfile(file, temporary)
 
     def read_bytes(self, path: str) -> bytes:
-        with reading(self.at(path), "a file"):
+        with reading(self.at(path), "a readable file"):
             return (self.folder / path).read_bytes()
 
     def write_bytes(self, path: str, content: bytes) -> None:
@@ -230,7 +237,7 @@ class ObjectStore:
     def check_source(self) -> None:
         if not self._has_any():
             raise StereoweaveError(
-                f"{self.place}: expected a folder, found no object in it; check the spelling"
+                f"{self.place}: expected a folder, found no objects in it; check the spelling"
             )
 
     def check_destination(self) -> None:
@@ -248,25 +255,25 @@ class ObjectStore:
     def fetch(self, path: str, into: Path) -> Path:
         with (
             replacing(into / path) as temporary,
-            self._library(path, "a file that can be read") as (library, source),
+            self._library(path, "a readable file") as (library, source),
         ):
             library.get_file(source, str(temporary))
         return into / path
 
     def put(self, file: Path, path: str) -> None:
-        with self._library(path, "a file that can be written") as (library, target):
+        with self._library(path, "a writable file") as (library, target):
             library.put_file(str(file), target)
 
     def read_bytes(self, path: str) -> bytes:
-        with self._library(path, "a file that can be read") as (library, source):
+        with self._library(path, "a readable file") as (library, source):
             return library.cat_file(source)
 
     def write_bytes(self, path: str, content: bytes) -> None:
-        with self._library(path, "a file that can be written") as (library, target):
+        with self._library(path, "a writable file") as (library, target):
             library.pipe_file(target, content)
 
     def exists(self, path: str) -> bool:
-        with self._library(path, "a file that can be read") as (library, source):
+        with self._library(path, "a readable file") as (library, source):
             try:
                 return library.info(source)["type"] == "file"
             except FileNotFoundError:
@@ -286,12 +293,12 @@ class ObjectStore:
         return self.place.startswith("s3://")
 
     def _has_any(self) -> bool:
-        """Return whether the folder has any object; an unreachable store fails within seconds."""
+        """Return whether the folder contains any objects; an unreachable store fails within seconds."""
         with self._library("", "a folder that can be listed") as (library, folder):
             bucket = folder.partition("/")[0]
             try:
                 if self._is_s3():
-                    # `info` would begin with a HEAD request, whose error gives no reason but "Forbidden".
+                    # `info` would begin with a HEAD request, whose error gives no reason except "Forbidden".
                     return bool(_fetch_page(library, folder, MaxKeys=1, timeout=_ANSWER_S).get("Contents"))
                 with suppress(FileNotFoundError):
                     library.info(folder, timeout=_ANSWER_S)
@@ -307,7 +314,7 @@ class ObjectStore:
 
     @contextmanager
     def _library(self, path: str, expected: str) -> Iterator[tuple["AsyncFileSystem", str]]:
-        """Yield the store's library and its name for a path; turn library errors into a StereoweaveError."""
+        """Yield the library and its name for a path; turn library errors into a StereoweaveError."""
         import fsspec
 
         try:
@@ -326,7 +333,7 @@ class ObjectStore:
 
 
 def _list_entries(folder: Path) -> list[os.DirEntry[str]]:
-    """Return a folder's entries, sorted and without hidden ones; none if it is missing or unreadable."""
+    """Return a folder's visible entries, sorted by name; empty if the folder is missing or unreadable."""
     with suppress(FileNotFoundError, PermissionError), os.scandir(folder) as entries:
         return sorted((entry for entry in entries if entry.name[0] != "."), key=lambda entry: entry.name)
     return []

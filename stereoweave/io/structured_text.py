@@ -1,7 +1,8 @@
 """Safe parsing of YAML, JSON and XML from untrusted files into plain values.
 
-Anchors, aliases and DTDs are refused, custom types are never built, and the nesting and number of values are
-checked before any recursion. Parsing time is proportional to the length of the text, which the caller limits.
+Anchors, aliases and DTDs are refused, custom types are never built, and the nesting and the number of
+values are checked before any recursion. The parsing time is proportional to the length of the text, which
+the caller limits.
 """
 
 import re
@@ -15,19 +16,19 @@ _NULLS = ("", "~", "null", "Null", "NULL")
 BASE64 = "$base64$"  # OpenCV's mark of binary data in JSON
 _DECLARATION = re.compile(r"<!(?!--|\[CDATA\[)")
 _XML_ITEM = re.compile(r'"[^"]*"|\S+')
-# Comments and tabs in JSON written by OpenCV and others. Strings, terminated or not, match too, and are kept.
+# Comments and tabs in JSON written by OpenCV and others. Strings, terminated or not, also match and are kept.
 _JSON_ALONE = re.compile(r'("(?:[^"\\]|\\.)*+"?)|//.*|\t')
 
 
 def parse_entries(text: str) -> dict[str, Any]:
-    """Parse YAML, JSON, or XML as cv2.FileStorage writes it.
+    """Parse YAML, JSON, or the XML that cv2.FileStorage writes.
 
     Returns:
         Entries by name. A value is an unconverted string, or a list or dict of values; binary data is a
         string that begins with BASE64. Entries that are null in YAML or JSON are left out.
 
     Raises:
-        ValueError or SyntaxError: if the text has another format, contains an anchor, an alias or a DTD, is
+        ValueError or SyntaxError: The text has another format, contains an anchor, an alias or a DTD, is
             nested more than 20 levels deep, or has more than 10,000 values.
     """
     start = text.lstrip()[:1]
@@ -41,7 +42,7 @@ def parse_entries(text: str) -> dict[str, Any]:
 
 
 class _Gate:
-    """Limits on the nesting and number of values, which a parser checks before it enters each value."""
+    """Limits on the nesting and the number of values, which a parser checks before it enters each value."""
 
     def __init__(self) -> None:
         self._depth = self._values = 0
@@ -49,14 +50,14 @@ class _Gate:
     def enter(self) -> None:
         self._depth += 1
         if self._depth > _MOST_DEEP:
-            raise ValueError(f"values nested more than {_MOST_DEEP} deep")
+            raise ValueError(f"values nested more than {_MOST_DEEP} levels deep")
         self.count(1)
 
     def count(self, values: int) -> None:
         self._values += values
         if self._values > _MOST_VALUES:
             raise ValueError(
-                f"more than {_MOST_VALUES} values; leave out entries other than the cameras', such as "
+                f"more than {_MOST_VALUES} values; remove entries that do not describe the cameras, such as "
                 "image_points"
             )
 
@@ -73,11 +74,11 @@ class _Loader(yaml.BaseLoader):
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         if self.check_event(yaml.AliasEvent):
-            raise ValueError("an alias (*); write its value in its place")
+            raise ValueError("an alias (*); replace it with its value")
         self._gate.enter()
         node = super().compose_node(parent, index)
         if self.anchors:  # useless without aliases
-            raise ValueError("an anchor (&); leave it out")
+            raise ValueError("an anchor (&); remove it")
         self._gate.leave()
         return node
 
@@ -114,7 +115,7 @@ def _parse_yaml(text: str) -> Any:
 
 
 class _Builder(ElementTree.TreeBuilder):
-    """ElementTree builder with limits on the nesting and number of values."""
+    """ElementTree builder with limits on the nesting and the number of values."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -134,7 +135,7 @@ class _Builder(ElementTree.TreeBuilder):
 
 
 def _parse_xml(text: str) -> Any:
-    # Refuse before parsing, because entities can include files and expand without limit.
+    # DTDs are refused before parsing, because entities can include files and expand without limit.
     if _DECLARATION.search(text):
         raise ValueError("XML with a DTD")
     root = ElementTree.fromstring(text, parser=ElementTree.XMLParser(target=_Builder()))
@@ -156,5 +157,5 @@ def _xml_value(element: ElementTree.Element) -> Any:
 
 
 def _xml_items(text: str) -> list[Any]:
-    """Split a sequence into numbers and words; words with spaces are quoted."""
+    """Split a sequence into numbers and words; words that contain spaces are quoted."""
     return [item.strip('"') for item in _XML_ITEM.findall(text)]

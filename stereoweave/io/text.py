@@ -10,8 +10,8 @@ from typing import Any, TextIO
 
 from stereoweave.io.files import replacing
 
-# Beginnings of formulas in spreadsheets (OWASP, "CSV Injection"), and the quote that marks a text: if it were
-# not escaped too, two names could become equal.
+# Beginnings of formulas in spreadsheets (OWASP, "CSV Injection"), and the apostrophe that marks text: if
+# apostrophes were not escaped too, two names could become equal.
 _COMPUTED = ("=", "+", "-", "@", "\t", "\r", "\n", "'")
 # Places where a spreadsheet may begin a cell: the separator depends on its language, and quotes within a cell
 # do not prevent a split.
@@ -33,7 +33,7 @@ def writing_text(path: str | Path) -> Iterator[TextIO]:
 
 
 def write_table(path: str | Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
-    """Write a CSV file with a header; text that a spreadsheet would run as a formula gets a leading '."""
+    """Write a CSV file with a header; an apostrophe is put before text that a spreadsheet would compute."""
     with writing_text(path) as file:
         writer = csv.DictWriter(file, columns)
         writer.writeheader()

@@ -12,25 +12,26 @@ from stereoweave.stereo import Estimate, StereoCamera
 # Probability that an error is within the stated uncertainty, as for one standard deviation of a normal
 # distribution.
 HOLDS = 0.6827
-# Pixels in this window around a pixel are on its surface if their disparities differ by at most this.
+# Pixels in the window around a pixel are on its surface if their disparities differ from its own by at most
+# this.
 _WINDOW_PX = 5
 _SAME_SURFACE_PX = 1.0
 _LEAST_CONFIDENCE = 0.5
 # Corresponds to an error of 0.15 px. Where the two shipped networks are more confident than this, 68 % of
-# their errors on painted pairs are below 0.10 px and 0.16 px.
+# their errors on painted pairs are below 0.10 px and 0.16 px, respectively.
 _MOST_CONFIDENT = 0.9995
 
 
 @dataclass(frozen=True, kw_only=True)
 class CameraError:
-    """Relative uncertainty of focal length and baseline: 0.01 is 1 %."""
+    """Relative uncertainties of the focal length and the baseline; 0.01 is 1 %."""
 
     focal: float = 0.0
     baseline: float = 0.0
 
     def __post_init__(self) -> None:
         if not (0 <= self.focal < math.inf and 0 <= self.baseline < math.inf):
-            raise StereoweaveError(f"expected uncertainties of at least 0, got {self}")
+            raise StereoweaveError(f"expected finite uncertainties of at least 0, got {self}")
 
 
 EXACT = CameraError()
@@ -40,7 +41,7 @@ EXACT = CameraError()
 class Measurement:
     """Distance between two points; its error is below uncertainty_m with a probability of 68 %.
 
-    first_m and second_m are the points in metres, in the left camera's axes: x right, y down, z forward.
+    first_m and second_m are the points in metres, in the left camera's axes: x right, y down and z forward.
     """
 
     distance_m: float
@@ -111,7 +112,7 @@ def distance(
 
 
 def disparity_error_px(confidence: float) -> float:
-    """Return the bound, in px, that 68 % of disparity errors at this confidence stay below."""
+    """Return the bound, in px, below which 68 % of the disparity errors at this confidence lie."""
     return math.log(1 - HOLDS) / math.log(1 - min(confidence, _MOST_CONFIDENT))
 
 
@@ -138,13 +139,17 @@ def _find_point_m(
 
 
 def _check_pixel(estimate: Estimate, pixel_px: tuple[int, int]) -> tuple[int, int]:
-    """Return column and row of a pixel; raise if it is outside, occluded or of low confidence."""
+    """Return a pixel's column and row.
+
+    Raises:
+        StereoweaveError: The pixel is outside the image, is occluded or has a low confidence.
+    """
     height, width = estimate.disparity_px.shape
     column, row = pixel_px
     if not (0 <= column < width and 0 <= row < height):
         raise StereoweaveError(
-            f"pixel {_format_pixel(pixel_px)}: expected a pixel of the left picture, {width}x{height} px, "
-            f"from 0,0 to {width - 1},{height - 1}, found one outside it"
+            f"expected a pixel of the left picture, from 0,0 to {width - 1},{height - 1}, "
+            f"found {_format_pixel(pixel_px)}"
         )
     if estimate.occluded[row, column]:
         raise StereoweaveError(

@@ -1,6 +1,6 @@
 """Coloured point clouds and meshes of a pair, and their PLY and GLB files.
 
-Arrays use the axes of computer vision, in metres: origin at the left camera, x right, y down, z forward.
+Arrays use the axes of computer vision, in metres: origin at the left camera, x right, y down and z forward.
 Files use the axes of 3-D viewers, in metres: x right, y up, with the camera looking along -z. glTF prescribes
 these axes; with them, MeshLab, CloudCompare and Open3D show PLY files upright.
 """
@@ -25,8 +25,8 @@ NO_CAMERA = Note(
     ),
 )
 MOST_POINTS = 4_000_000
-# Largest disparity difference between neighbouring pixels of a surface that both cameras see; a larger one is
-# a depth edge.
+# Largest disparity difference between neighbouring pixels of a surface that both cameras see; a larger
+# difference is a depth edge.
 _STEEPEST_PX = 1.0
 # Half the size of the window in which a mixed pixel has both a nearer and a farther neighbour.
 _REACH_PX = 2
@@ -36,7 +36,7 @@ _VIEWER_AXES = np.array([1, -1, -1], np.float32)
 
 
 class EmptyError(StereoweaveError):
-    """Error for a pair from which no point or no triangle can be made."""
+    """Error for a pair that yields no points or no triangles."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +44,7 @@ class PointCloud:
     """Coloured point cloud.
 
     Attributes:
-        points_m: float32 [N, 3] in metres, in the left camera's axes: x right, y down, z forward.
+        points_m: float32 [N, 3] in metres, in the left camera's axes: x right, y down and z forward.
         colours: uint8 RGB [N, 3], from the left image.
         step_px: Sampling step along rows and columns.
     """
@@ -70,7 +70,8 @@ def make_point_cloud(
         pair: The pair, with its camera.
         estimate: The pair's estimate.
         least_confidence: Lowest confidence of a pixel to use.
-        most_points: Largest number of points. If there are more, only every nth row and column is used.
+        most_points: Largest number of points. If there are more, only every nth row and every nth column
+            are used.
 
     Raises:
         StereoweaveError: The pair has no camera.
@@ -86,14 +87,14 @@ def make_mesh(
 ) -> Mesh:
     """Return the mesh through the points of `make_point_cloud`, open at depth edges.
 
-    The arguments and errors are the same. Neighbouring pixels are joined unless their disparities differ by
-    more than 1 px per pixel. Points that no triangle uses are removed.
+    The arguments and errors are those of `make_point_cloud`. Neighbouring pixels are joined unless their
+    disparities differ by more than 1 px per pixel. Points that no triangle uses are removed.
     """
     camera = require_camera(pair)
     known, step_px = _thin(find_reliable(pair, estimate, least_confidence), most_points)
     faces = _triangulate(known, estimate.disparity_px[::step_px, ::step_px], _STEEPEST_PX * step_px)
     if not len(faces):
-        raise EmptyError("expected neighbouring pixels of known depth on one surface, found none")
+        raise EmptyError("expected neighbouring pixels of known depth on the same surface, found none")
     used = np.zeros(np.count_nonzero(known), bool)
     used[faces] = True
     cloud = _place_points(pair, estimate, camera, np.argwhere(known)[used] * step_px, step_px)
@@ -110,8 +111,8 @@ def find_reliable(
 ) -> Bool[np.ndarray, "h w"]:
     """Return the mask of the left image's pixels with reliable depth.
 
-    Excluded are occluded pixels, pixels outside the image's content, pixels with a confidence below
-    `least_confidence`, pixels with a disparity + doffs below 1 px (nearly infinite depth), and mixed pixels.
+    It excludes occluded pixels, pixels outside the image's content, pixels with a confidence below
+    `least_confidence`, pixels with disparity + doffs below 1 px (nearly infinite depth), and mixed pixels.
     Matchers blur depth edges, so the points of mixed pixels would float between two surfaces. A mixed pixel
     has, within 2 px along its row or its column, one neighbour that is nearer by more than 1 px of disparity
     and one that is farther by more than 1 px.
@@ -126,7 +127,7 @@ def find_reliable(
 
 
 def require_camera(pair: StereoPair) -> StereoCamera:
-    """Return the pair's camera; raise a StereoweaveError with a remedy if it has none."""
+    """Return the pair's camera; raise a StereoweaveError with a remedy if the pair has none."""
     if pair.camera is None:
         raise StereoweaveError(NO_CAMERA.text, remedy=NO_CAMERA.remedy)
     return pair.camera
@@ -149,7 +150,7 @@ def write_glb(path: str | Path, cloud: PointCloud) -> None:
     linear = _linearize(cloud.colours)
 
     def colour_exactly(buffers: Any, tree: dict[str, Any]) -> None:
-        # glTF colours are linear; trimesh writes them with 8 bits, too few for dark colours.
+        # glTF colours are linear; trimesh writes them with 8 bits, which are too few for dark colours.
         accessor_at = tree["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]
         accessor = list(tree["accessors"].values())[accessor_at]
         buffers[list(buffers)[accessor["bufferView"]]] = linear.tobytes()
@@ -179,8 +180,8 @@ def _thin(known: Bool[np.ndarray, "h w"], most_points: int) -> tuple[Bool[np.nda
         step_px += 1
     if not thinned.any():
         raise EmptyError(
-            "expected pixels of known depth, found none that are confident, seen by both cameras and not "
-            "infinitely far"
+            "expected pixels of known depth, found none that are confident, are seen by both cameras and are "
+            "not infinitely far"
         )
     return thinned, step_px
 
@@ -192,7 +193,7 @@ def _place_points(
     places: Int[np.ndarray, "n 2"],
     step_px: int,
 ) -> PointCloud:
-    """Return the point cloud of pixels that are given by row and column."""
+    """Return the point cloud of the pixels that are given by their rows and columns."""
     rows, columns = places.T
     depth_m = camera.depth_m(estimate.disparity_px[rows, columns][None])[0]
     x, y = (columns - camera.cx_px) / camera.focal_px, (rows - camera.cy_px) / camera.focal_px
@@ -205,7 +206,7 @@ def _triangulate(
 ) -> Int[np.ndarray, "m 3"]:
     """Return up to two triangles per square of pixels.
 
-    The corners of a triangle are known, and their disparities differ by at most `most_px`.
+    The depth of all three corners is known, and their disparities differ by at most `most_px`.
     """
     number = np.cumsum(known).reshape(known.shape) - 1
     here, right, below, across = np.s_[:-1, :-1], np.s_[:-1, 1:], np.s_[1:, :-1], np.s_[1:, 1:]

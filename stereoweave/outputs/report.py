@@ -1,4 +1,4 @@
-"""Self-contained HTML report on a result: images, summary, and new views with a slider."""
+"""Self-contained HTML report on a result: images, a summary, and new views with a slider."""
 
 import base64
 import html
@@ -64,9 +64,9 @@ def summarize(
     Args:
         pair: The pair.
         estimate: The pair's estimate.
-        pictures: File names of the pair.
+        pictures: File names of the pictures.
         model: Name of the matcher.
-        estimate_ms: Duration of the matching.
+        estimate_ms: Duration of matching.
     """
     height_px, width_px = estimate.disparity_px.shape
     seen = slice(None) if pair.left_seen is None else pair.left_seen
@@ -95,8 +95,8 @@ def write_report(
     """Write the report as a single HTML file without external resources.
 
     The report shows the left image, the depth (or the disparity if the camera is unknown), the confidence,
-    the summary, and a slider through the views from POSITIONS. Images have at most 1000 px on the longer
-    side. `threads` is the number of threads for rendering.
+    the summary, and the views from POSITIONS with a slider to move the viewpoint. Images have at most 1000 px
+    on the longer side. `threads` is the number of threads for rendering.
     """
     source = importlib.resources.files("stereoweave.outputs") / "report.html"
     template = source.read_text(encoding="utf-8")
@@ -173,15 +173,15 @@ def downscale(pair: StereoPair, estimate: Estimate, longer_side_px: int) -> tupl
 
 
 def _resize_nearest(values: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Resize a map to (width, height) by nearest neighbour: means across depth edges lie on no surface."""
+    """Resize a map to (width, height) by nearest neighbour, as means across depth edges lie on no surface."""
     numbers = values.view(np.uint8) if values.dtype == bool else values
     return cv2.resize(numbers, size, interpolation=cv2.INTER_NEAREST_EXACT).view(values.dtype)
 
 
 def _encode_disparity(estimate: Estimate) -> dict[str, object]:
-    """Encode the disparity that is shown at the pointer as low_px + step_px * level.
+    """Encode the disparities that are shown at the pointer as low_px + step_px * level.
 
-    The 16-bit levels are encoded in base64.
+    The levels have 16 bits and are encoded in base64.
     """
     height, width = estimate.disparity_px.shape
     scale = min(1.0, _LONGER_SIDE_OF_MAP_PX / max(height, width))
@@ -200,7 +200,7 @@ def _encode_disparity(estimate: Estimate) -> dict[str, object]:
 
 
 def _list_numbers(summary: Summary) -> list[tuple[str, str]]:
-    """Return the rows of the summary table: name, and value with unit."""
+    """Return the rows of the summary table, each of which is a name and a value with its unit."""
     rows = [
         ("Size", f"{summary.width_px} × {summary.height_px} px"),
         ("Model", summary.model),
@@ -227,7 +227,7 @@ def _list_numbers(summary: Summary) -> list[tuple[str, str]]:
 def _label_ticks(range_px: tuple[float, float], camera: StereoCamera | None) -> list[str]:
     """Return five labels for the colour bar, evenly spaced in disparity.
 
-    They are in metres if the camera is known, else in pixels.
+    The labels are in metres if the camera is known, else in pixels.
     """
     values_px = np.linspace(*range_px, 5)
     if camera is None:

@@ -1,7 +1,8 @@
 """Output files of the `depth` command: maps, masks, previews, point clouds, meshes and the report.
 
-Disparity and depth are unknown outside the left image's content (`StereoPair.left_seen`): infinity in PFM, as
-in Middlebury, NaN in NPY and TIFF, 0 in PNG. Infinite depth is infinity in PFM, NPY and TIFF, and 0 in PNG.
+Disparity and depth are unknown outside the left image's content (`StereoPair.left_seen`). Unknown values are
+stored as infinity in PFM (as in Middlebury), as NaN in NPY and TIFF, and as 0 in PNG. Infinite depth is
+stored as infinity in PFM, NPY and TIFF, and as 0 in PNG.
 """
 
 import hashlib
@@ -78,16 +79,16 @@ ALL = "all"
 
 @dataclass(frozen=True, kw_only=True)
 class DepthJob:
-    """Settings of `depth` for every pair.
+    """Settings of the `depth` command, which are the same for every pair.
 
     Attributes:
-        request: How the pictures are opened and rectified.
+        request: Settings for opening and rectifying the pictures.
         backend: The matcher and the hardware that runs it.
         options: Matching settings.
         files: Output files besides `always`: names in FILES, or "all". depth.png is added if the camera is
             known.
         always: Output files written for every pair.
-        name_of: The front end's names of settings, for the notes and failures that a batch records.
+        name_of: The front end's names for settings, for the notes and errors that a batch records.
     """
 
     request: Request = Request()
@@ -117,7 +118,7 @@ def make_depth(pictures: Sequence[Path], out: Path, job: DepthJob) -> tuple[Summ
 
 
 def job_facts(job: DepthJob) -> dict[str, Any]:
-    """Return everything but the pictures that determines a pair's results; files are given by their hashes.
+    """Return everything that determines a pair's results, except the pictures; files are given as hashes.
 
     The provider and the number of threads are left out, so that a batch whose GPU fails can be finished on
     the CPU.
@@ -145,10 +146,10 @@ def needs_camera(file: str) -> bool:
 
 
 def _choose_files(job: DepthJob, pair: StereoPair) -> tuple[list[str], list[Note]]:
-    """Return a pair's output files, and notes on files left out.
+    """Return a pair's output files, and notes on the files that are left out.
 
     Raises:
-        StereoweaveError: A file needs a camera, but the pair has none; or trimesh is missing.
+        StereoweaveError: A file needs a camera but the pair has none, or trimesh is missing.
     """
     wanted, notes = {*job.always, *job.files}, list[Note]()
     if pair.camera:
@@ -171,9 +172,10 @@ def _choose_files(job: DepthJob, pair: StereoPair) -> tuple[list[str], list[Note
 def _write_together(out: Path) -> Iterator[Path]:
     """Yield a temporary folder whose files move to `out` at the end; an error leaves `out` unchanged.
 
-    Files of an earlier result that the new one lacks are removed, so that all of `out` belongs to one result.
-    An earlier result is recognised by disparity.pfm, which every result has and which is moved first. In a
-    folder without it, files with the names of output files are the user's and stay.
+    Files of an earlier result that the new result lacks are removed, so that all output files in `out` belong
+    to the same result. An earlier result is recognised by disparity.pfm, which every result has and which is
+    moved first. In a folder without disparity.pfm, files with the names of output files are taken to be the
+    user's and are kept.
     """
     standing = make_parent_folder(*(out / file for file in FILES))
     with tempfile.TemporaryDirectory(prefix=".stereoweave-", dir=standing) as name:
@@ -198,7 +200,7 @@ def write_files(folder: Path, files: Sequence[str], result: Result) -> list[Note
             notes += _note_thinning(file, result)
         except RangeError:
             text = (
-                "no disparity.png: it holds 0 to 255.99 px, found "
+                "no disparity.png: expected disparities of 0 to 255.99 px, found "
                 f"{result.summary.disparity_min_px:.2f} to {result.summary.disparity_max_px:.2f} px"
             )
             notes.append(Note(text, Remedy("use disparity.pfm")))
@@ -218,4 +220,8 @@ def _note_thinning(file: str, result: Result) -> list[Note]:
             step_px = 1
     if step_px == 1:
         return []
-    return [Note(f"{file}: thinned to one of {step_px}x{step_px} pixels, for at most {MOST_POINTS:,} points")]
+    return [
+        Note(
+            f"{file}: thinned to one point per {step_px}x{step_px} pixels, for at most {MOST_POINTS:,} points"
+        )
+    ]

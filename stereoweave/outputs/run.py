@@ -67,13 +67,13 @@ class Result:
 
 
 def run(prepared: Prepared, matcher: Matcher, options: MatchOptions) -> Result:
-    """Match and summarise a prepared pair. Raises the errors of `match`."""
+    """Match and summarise a prepared pair. Raises the same errors as `match`."""
     (result,) = run_many([prepared], matcher, options)
     return result
 
 
 def run_many(prepared: Sequence[Prepared], matcher: Matcher, options: MatchOptions) -> list[Result]:
-    """Match prepared pairs together and summarise each one with an equal share of the matching time."""
+    """Match prepared pairs together and summarise each of them with an equal share of the matching time."""
     start_s = time.perf_counter()
     estimates = match_many(matcher, [each.pair for each in prepared], options)
     total_ms = 1000 * (time.perf_counter() - start_s)

@@ -66,13 +66,13 @@ def open_pictures(paths: Sequence[Path], format: str | None = None) -> Opened:
     Args:
         paths: One or two files.
         format: Layout of one file with both views, a name in `FORMATS`. Default: detected from the file
-            format, the file's name, then its content.
+            format, the file name and the content, in this order.
 
     Raises:
         FormatError: A file is unreadable, is too large, has an unsupported format (named in the error) or
             lacks a second view; or the two pictures differ in size.
-        StereoweaveError: The layout is unknown or given for two files, or there are neither one nor two
-            files.
+        StereoweaveError: The layout is unknown or given for two files, or the number of files is neither one
+            nor two.
     """
     if format not in (None, *FORMATS):
         raise StereoweaveError(f"expected one of {', '.join(FORMATS)}, found {format!r}", setting="format")
@@ -81,7 +81,7 @@ def open_pictures(paths: Sequence[Path], format: str | None = None) -> Opened:
             if format is not None:
                 raise StereoweaveError(
                     f"expected one picture that holds both views, found two, {left} and {right}; "
-                    "leave it out, and give the left one first",
+                    "omit this setting, and give the left picture first",
                     setting="format",
                 )
             return _open_two(left, right)
@@ -94,7 +94,7 @@ def open_pictures(paths: Sequence[Path], format: str | None = None) -> Opened:
 
 
 def pixel_factor(path: Path, picture: Image.Image, format: str | None) -> int:
-    """Return the number of pixels of both views divided by the number in their file's header: 1 or 2.
+    """Return the ratio, 1 or 2, of the number of pixels in both views to the number in the file's header.
 
     It is 2 for MPO files, and for half-size views declared by `format` or by the file's JPS header.
     """
@@ -122,7 +122,9 @@ def _open_one(path: Path, format: str | None) -> Opened:
         if frames:
             return _open_mpo(path, picture, frames)
         if format == "mpo":
-            raise FormatError(f"{path}: expected an MPO file with two pictures of one size, found one")
+            raise FormatError(
+                f"{path}: expected an MPO file with two pictures of the same size, found only one"
+            )
         name, why = _read_declared(path, picture, format)
         decoded = decode(path, picture)
     lies = exif.read_orientation(decoded.tags)
@@ -141,7 +143,7 @@ def _open_one(path: Path, format: str | None) -> Opened:
 
 
 def _open_mpo(path: Path, picture: Image.Image, frames: Sequence[int]) -> Opened:
-    """Open the pair in an MPO file; the first picture's orientation applies to both: one camera took them."""
+    """Open the pair in an MPO file; both have the first picture's orientation, as one camera took them."""
     decoded = [read_frame(path, picture, index) for index in frames]
     lies = exif.read_orientation(decoded[0].tags)
     # CIPA DC-007 numbers viewpoints from the left; many files omit the number and store the left view first.
@@ -149,7 +151,7 @@ def _open_mpo(path: Path, picture: Image.Image, frames: Sequence[int]) -> Opened
     left, right = (each.upright(lies) for each in decoded)
     if left.shape != right.shape:
         sizes = " and ".join(f"{eye.shape[1]}x{eye.shape[0]}" for eye in (left, right))
-        raise FormatError(f"{path}: expected an MPO file with two pictures of one size, found {sizes}")
+        raise FormatError(f"{path}: expected an MPO file with two pictures of the same size, found {sizes}")
     check_large_enough(path, left)
     return Opened(
         pair=StereoPair(left=left, right=right),
@@ -166,11 +168,11 @@ def _open_mpo(path: Path, picture: Image.Image, frames: Sequence[int]) -> Opened
 def _choose_orientations(
     left: DecodedPicture, right: DecodedPicture
 ) -> tuple[tuple[int | None, int | None], list[Note]]:
-    """Return the EXIF orientation to use for each of two pictures, and notes on it.
+    """Return the EXIF orientation to use for each of two pictures, and notes on the choice.
 
     Each picture uses its own tag, unless the sizes then differ or one tag is missing: some editors rotate a
-    picture before they drop the tag, others do not. In these cases, both pictures use the same tag if this
-    makes the sizes equal and the pictures more similar.
+    picture before they drop the tag, and others only drop it. In these cases, both pictures use the same tag
+    if this makes the sizes equal and the pictures more similar.
     """
     own = exif.read_orientation(left.tags), exif.read_orientation(right.tags)
     if own[0] == own[1] or {*own} <= {None, 1}:
@@ -199,10 +201,10 @@ def _compare(left: DecodedPicture, right: DecodedPicture, lies: tuple[int | None
 
 
 def _read_declared(path: Path, picture: Image.Image, format: str | None) -> tuple[str | None, str | None]:
-    """Return the layout declared by the user or a JPS file, and where it came from unless it was the user.
+    """Return the layout that the user or a JPS file declares, and where it was found unless the user gave it.
 
-    Both are None if no layout is declared. Source: VRex's JPS format, which has four bytes after identifier
-    and length: separation, flags, layout and type.
+    Both are None if no layout is declared. Source: VRex's JPS format, in which four bytes follow the
+    identifier and the length: separation, flags, layout and type.
     """
     if format not in (None, "jps"):
         return format, None
@@ -248,7 +250,7 @@ def _split_views(
 
 
 def _read_lens(decoded: Sequence[DecodedPicture]) -> exif.Lens | None:
-    """Read camera parameters from the tags of both pictures; those of the first one take precedence."""
+    """Read camera parameters from the tags of both pictures; the first picture's tags take precedence."""
     first, second = decoded
     return exif.read_lens({**second.tags, **first.tags}, *first.image.size)
 
@@ -258,7 +260,7 @@ def _note_turns(lies: int | None) -> list[Note]:
 
 
 def _note_colours(decoded: Sequence[DecodedPicture]) -> list[Note]:
-    """Return notes on colour conversions: a single one if both pictures had the same conversion."""
+    """Return notes on colour conversions: a single note if both pictures had the same conversion."""
     texts = [each.note for each in decoded]
     if len(set(texts)) == 1:
         return [Note(text) for text in texts[:1] if text]

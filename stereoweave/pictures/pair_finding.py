@@ -1,4 +1,4 @@
-"""Finding and naming of the pairs of a batch, in a folder, by two glob patterns or in a list."""
+"""Finding the pairs of a batch, in a folder, by two glob patterns or in a list, and naming them."""
 
 import csv
 import glob
@@ -22,14 +22,15 @@ _CALIBRATION = "calib.txt"
 _ENDINGS = {
     # Unsupported formats are included, so that opening them fails with an error that names the format.
     "picture": (*ENDINGS, ".heic", ".heif"),
-    # These are pairs even if there are pictures beside them: cameras also write an .mpo file's left view as
-    # .jpg.
+    # These are pairs even if there are pictures beside them, because cameras also write an .mpo file's left
+    # view as .jpg.
     "both views": (".mpo", ".jps", ".pns"),
     "film": (".mp4", ".mkv", ".mov", ".avi", ".webm"),
 }
 _SIDES = {"left": "right", "Left": "Right", "LEFT": "RIGHT", "l": "r", "L": "R", "im0": "im1"}
 _OTHER_SIDES = _SIDES | {right: left for left, right in _SIDES.items()}
-# Matches left, leftImg8bit and imgLeft, but not leftover; a single letter only at the start or end of a name.
+# Matches left, leftImg8bit and imgLeft, but not leftover; matches a single letter only at the start or the
+# end of a name.
 _MARK = re.compile(
     r"(?<![A-Za-z])(?:left|right|LEFT|RIGHT)(?![a-z])|(?:Left|Right)(?![a-z])"
     r"|^[lLrR](?=$|[ _.-])|(?<![A-Za-z])[lLrR]$|^im[01]$"
@@ -43,10 +44,10 @@ _TAKEN = re.compile(
 
 @dataclass(frozen=True)
 class NamedPair:
-    """A pair of a batch.
+    """A pair in a batch.
 
     Attributes:
-        name: Name of the pair and of the folder of its results, unique in the batch.
+        name: Name of the pair and of its results folder, unique in the batch.
         pictures: Left and right picture, or one picture with both views.
         calibration: The pair's own calibration file, if any.
     """
@@ -60,9 +61,9 @@ class ListedPair(NamedTuple):
     """A pair or video among listed files.
 
     Attributes:
-        name: Name of the pair or video and of the folder of its results, unique among the files.
-        files: Paths, with "/" as separator, of the left and right picture, one picture with both views, or
-            the video.
+        name: Name of the pair or video and of its results folder, unique among the files.
+        files: Paths, with "/" as separator, of the left and the right picture, of one picture with both
+            views, or of the video.
         calibration: Path of the pair's own calibration file, if any.
     """
 
@@ -99,13 +100,13 @@ def find_pairs(
         listed: File with a list of pairs.
 
     Raises:
-        StereoweaveError: Pictures, patterns and list are all missing, or more than one of them is given; see
-            also `find_pairs_in`, `find_pairs_by_globs` and `read_pair_list`.
+        StereoweaveError: Pictures, patterns and the list are all missing, or more than one of them is given;
+            see also `find_pairs_in`, `find_pairs_by_globs` and `read_pair_list`.
     """
     ways = {"pictures": pictures, "patterns": left or right, "a list": listed}
     given = [way for way, value in ways.items() if value]
     if len(given) != 1 or (left is None) != (right is None):
-        found = " with ".join(given) if len(given) != 1 else "only one of the two patterns"
+        found = " and ".join(given) if len(given) != 1 else "only one of the two patterns"
         raise StereoweaveError(
             "expected pictures or a folder, patterns of left and right pictures, or a list of pairs, "
             f"found {found or 'none'}",
@@ -119,7 +120,9 @@ def find_pairs(
 
 
 def find_pairs_in(folder: Path) -> FoundPairs:
-    """Find the pairs in a folder and its subfolders (`find_pairs_among`); a note counts unpaired pictures.
+    """Find the pairs in a folder and its subfolders (`find_pairs_among`).
+
+    A note gives the number of unpaired pictures.
 
     Raises:
         StereoweaveError: The folder does not exist or has no pictures, or two pairs have the same name.
@@ -192,11 +195,12 @@ def find_pairs_by_globs(left: str, right: str) -> list[NamedPair]:
     for side, pattern, found in (("left", left, lefts), ("right", right, rights)):
         if not found:
             raise StereoweaveError(
-                f"expected pictures that match {pattern}, found none; quote the pattern", setting=side
+                f"expected pictures that match {pattern}, found none; check and quote the pattern",
+                setting=side,
             )
     if len(lefts) != len(rights):
         raise StereoweaveError(
-            f"expected as many left pictures as right ones, found {len(lefts)} for {left} and "
+            f"expected as many left pictures as right pictures, found {len(lefts)} for {left} and "
             f"{len(rights)} for {right}"
         )
     fixed = takewhile(lambda part: not re.search(r"[*?\[]", part), Path(left).parent.parts)
@@ -224,12 +228,12 @@ def read_pair_list(path: Path) -> list[NamedPair]:
     for number, row in rows.items():
         if not 1 <= len(row) <= 3 or not row[0]:
             raise FormatError(
-                f"{path}, line {number}: expected left, right and optionally a name, "
+                f"{path}, line {number}: expected the left picture, the right picture and optionally a name, "
                 f"found {len(row)} columns: "
                 f"{lines[number - 1].strip()}"
             )
     if not rows:
-        raise FormatError(f"{path}: expected one pair per line, found none")
+        raise FormatError(f"{path}: expected a list with one pair per line, found no pairs")
     pictures = [tuple(path.parent / column for column in row[:2] if column) for row in rows.values()]
     return _make_pairs(pictures, path.parent, [row[2] if len(row) == 3 else "" for row in rows.values()])
 
@@ -280,9 +284,9 @@ def _pair_by_marks(paths: Sequence[str]) -> list[tuple[str, str]]:
 
 
 def _swap_sides(path: str) -> tuple[list[str], bool] | None:
-    """Return the other picture's possible paths, and whether this one is the left one; None without marks.
+    """Return the other picture's possible paths, and whether this picture is the left one.
 
-    In the other path, all marks are swapped, or only the last one.
+    The other path has all marks swapped, or only the last mark. Return None if the path has no marks.
     """
     stem, ending = splitext(path)
     parts = stem.split("/")
@@ -298,7 +302,7 @@ def _swap_sides(path: str) -> tuple[list[str], bool] | None:
 
 
 def _split_path(path: str) -> list[str]:
-    """Split a path into its parts, of which the last has no ending."""
+    """Split a path into its parts, without the file extension."""
     return splitext(path)[0].split("/")
 
 
@@ -320,7 +324,10 @@ def _split_columns(where: str, line: str) -> list[str]:
     try:
         [row] = csv.reader([line.strip()], delimiter=delimiter, skipinitialspace=delimiter == ",")
     except csv.Error as error:
-        raise FormatError(f"{where}: expected left, right and optionally a name, found {error}") from error
+        raise FormatError(
+            f"{where}: expected the left picture, the right picture and optionally a name, found a line that "
+            f"cannot be parsed ({error})"
+        ) from error
     return [column.strip() for column in row if column or delimiter != " "]
 
 
@@ -328,7 +335,7 @@ def _make_pairs(
     pictures: Iterable[tuple[Path, ...]], root: Path, names: Iterable[str] = repeat("")
 ) -> list[NamedPair]:
     """Create the pairs; a pair's name defaults to its path below `root` without marks."""
-    # Not `resolve`, which follows links: users must recognise the names.
+    # Not `resolve`, which follows links; users must recognise the names.
     above = Path(os.path.abspath(root))  # noqa: PTH100
     pairs = []
     for paths, given in zip(pictures, names, strict=False):
@@ -344,7 +351,10 @@ def _make_pairs(
 
 
 def _check_names(names: Iterable[tuple[str, str | Path]]) -> None:
-    """Raise a StereoweaveError if two pairs have the same name; `names` gives name and first file of each."""
+    """Raise a StereoweaveError if two pairs have the same name.
+
+    `names` gives the name and the first file of each pair.
+    """
     seen: dict[str, str | Path] = {}
     for name, file in names:
         # Some file systems ignore case.
@@ -368,7 +378,7 @@ def _strip_marks(part: str) -> str:
 
 
 def _sanitize(name: str) -> str:
-    """Make a name valid as a folder name on every system, and different from a batch's own files."""
+    """Return a name that is valid for a folder on every system and differs from a batch's own files."""
     name = _NOT_IN_NAMES.sub("_", name).strip(" .") or "pair"
     return f"{name}_" if _TAKEN.fullmatch(name) else name
 

@@ -17,7 +17,7 @@ Frame = UInt8[np.ndarray, "rows columns 3"]
 
 
 class PairLayout(NamedTuple):
-    """Layout of two views in one frame; by default side by side, full size, left view first."""
+    """Layout of two views in one frame; by default side by side at full size, with the left view first."""
 
     beside: bool = True
     half: bool = False
@@ -33,7 +33,7 @@ class PairLayout(NamedTuple):
         if extent_px % 2 or extent_px < 2 * SMALLEST_SIDE_PX:
             raise FormatError(
                 f"expected an even {side} of at least {2 * SMALLEST_SIDE_PX} pixels for two views, "
-                f"found {width_px}x{height_px}; crop it or scale it first"
+                f"found {width_px}x{height_px}; crop or rescale it first"
             )
         if self.half:
             return width_px, height_px
@@ -71,9 +71,9 @@ _HALF = {"half", "hsbs", "halfsbs", "htb", "htab", "hou", "halfou"}
 _FULL = {"full", "lrf", "rlf", "tbf", "fsbs", "fullsbs", "fulltb", "fullou"}
 
 # Aspect ratios of one view. Screens and cameras have 4:3 to 2.4:1; views outside this range are half size. An
-# upright video, 9:16, cannot be told from a half-size view by its aspect ratio, and is taken for one.
+# upright video, 9:16, cannot be distinguished from a half-size view by its aspect ratio and is taken for one.
 _NARROWEST_EYE, _WIDEST_EYE = 1.2, 2.5
-# Photographs are upright, square or wide. If the aspect ratio fits full and half size, the ratio of
+# Photographs are upright, square or wide. If the aspect ratio fits both full and half size, the ratio of
 # horizontal to vertical contrast between neighbouring pixels decides. Its median over painted pictures is
 # 0.96 for full views, 1.58 for half width and 0.57 for half height.
 _UPRIGHT_EYE, _LOW_EYE, _LOWEST_EYE, _SQUEEZED_CONTRAST = 0.5, 2.0, 3.0, 1.25
@@ -84,8 +84,8 @@ _DETAIL_PX = 480
 _NARROWEST_BESIDE, _WIDEST_ABOVE = 1.05, 2.45
 
 # The resemblance is 0.34 or more for 95 % of painted or rendered pairs, many of which have far larger
-# disparities than films. It is at most 0.13 for the two halves of a single picture, and at most 0.23 if the
-# picture is a blurred enlargement.
+# disparities than 3-D videos. It is at most 0.13 for the two halves of a single picture, and at most 0.23 if
+# the picture is a blurred enlargement.
 _ALIKE = 0.3
 _SMALL_PX = 160, 120
 _WINDOW_PX, _STEP_PX, _SHIFT_PX, _OFF_PX = 20, 10, 32, 2
@@ -101,9 +101,9 @@ def detect_layout(
 ) -> str:
     """Detect a video's layout, a name in `PAIR_LAYOUTS`, from its container, its name or its frames.
 
-    The frames must confirm a layout in the name, unless they are too plain: "LR" has other meanings too. The
-    frames do not show which view comes first; it is the left one, unless the container or the name says
-    otherwise.
+    The frames must confirm a layout in the name, unless they are too plain, because "LR" has other meanings
+    too. The frames do not show which view comes first; the left view is taken to be first, unless the
+    container or the name says otherwise.
 
     Args:
         name: Path of the file, whose name may contain a layout, such as film_SBS or film-half-OU.
@@ -131,12 +131,12 @@ def detect_layout(
 
 
 def measure_resemblance(first: Picture, second: Picture) -> float:
-    """Score from 0 to 1 how likely two images show the same scene; return NaN if they are too plain.
+    """Return a score from 0 to 1 for whether two images show the same scene; NaN if they are too plain.
 
     Windows of the first image are matched in the second one, up to a fifth of the width away. The score is
-    the median of their best correlations, times the share of neighbouring windows with similar shifts:
-    repeated patterns also correlate, but with scattered shifts. Both images are first resized to the same
-    small size and high-pass filtered, because skies and floors look alike everywhere.
+    the median of their best correlations, times the share of neighbouring windows with similar shifts,
+    because repeated patterns also correlate, but with scattered shifts. Both images are first resized to the
+    same small size and high-pass filtered, because skies and floors look alike everywhere.
     """
     here, there = _extract_detail(first), _extract_detail(second)
     rows = range(_OFF_PX, _SMALL_PX[1] - _WINDOW_PX - _OFF_PX + 1, _STEP_PX)
@@ -153,7 +153,7 @@ def measure_resemblance(first: Picture, second: Picture) -> float:
 def _match_window(
     here: Float32[np.ndarray, "h w"], there: Float32[np.ndarray, "h w"], top: int, left: int
 ) -> tuple[float, float]:
-    """Return a window's best correlation and the shift there, in pixels; both are NaN for a plain window."""
+    """Return a window's best correlation and its shift in pixels; both are NaN for a plain window."""
     window = here[top : top + _WINDOW_PX, left : left + _WINDOW_PX]
     if window.std() < _PLAIN:
         return np.nan, np.nan
@@ -198,9 +198,11 @@ def _detect_by_content(name: str, frames: Sequence[Frame], photograph: bool) -> 
     if alike[best] >= _ALIKE:
         return best
     found = (
-        "too plain a picture to tell" if np.isnan(alike[best]) else "halves that do not resemble each other"
+        "a picture that is too plain to tell"
+        if np.isnan(alike[best])
+        else "halves that do not resemble each other"
     )
-    expected = "a stereo picture" if photograph else "3-D video"
+    expected = "a stereo picture" if photograph else "a 3-D video"
     raise FormatError(
         f"{name}: expected {expected}, two views side by side or one above the other, found {found}; "
         "give two files, left and right",

@@ -22,7 +22,7 @@ class Request:
         format: Layout of one picture with both views, a name in `loading.FORMATS`; default: detected.
         calibration: Calibration file of the two cameras (`calibration_files.read_rig`).
         focal_px, baseline_m: Focal length and baseline, instead of a calibration; default: from EXIF.
-        rectify: Whether to rectify the pair, with the calibration or, without one, from feature matches.
+        rectify: Whether to rectify the pair, using the calibration or, if there is none, feature matches.
     """
 
     format: str | None = None
@@ -34,7 +34,7 @@ class Request:
     def __post_init__(self) -> None:
         if self.calibration and not (self.focal_px is None and self.baseline_m is None):
             raise StereoweaveError(
-                f"{self.calibration}: expected a calibration, or focal length and baseline, found both"
+                f"{self.calibration}: expected either a calibration or focal length and baseline, found both"
             )
 
 
@@ -48,10 +48,10 @@ class Prepared:
 
 
 def prepare(pictures: Sequence[Path], request: Request) -> Prepared:
-    """Open a pair, from two pictures (left first) or one picture with both views; rectify it if requested.
+    """Open a pair from two pictures (left first) or one picture with both views; rectify it if requested.
 
-    The camera comes from the calibration, from the request, or from EXIF. The pair has no camera if focal
-    length or baseline is unknown, or if it was rectified from feature matches.
+    The camera comes from the calibration, from the request, or from EXIF. The pair has no camera if the
+    focal length or the baseline is unknown, or if the pair was rectified from feature matches.
 
     Raises:
         StereoweaveError: See `open_pictures`, `read_rig`, `rectify` and `rectify_by_features`; or the request
@@ -96,21 +96,24 @@ def _find_camera(
         return camera, (Note(f"from EXIF: {', '.join(from_exif)}"),) if from_exif else ()
     if request.focal_px is not None:
         raise StereoweaveError(
-            "metres: expected a baseline in addition to the focal length, found none",
+            "metres: expected a baseline besides the focal length, found none in EXIF",
             remedy=Remedy("give the baseline", ("baseline_m",)),
         )
     if request.baseline_m is not None:
         raise StereoweaveError(
-            "metres: expected a focal length in EXIF in addition to the baseline, found none",
+            "metres: expected a focal length besides the baseline, found none in EXIF",
             remedy=Remedy("give the focal length", ("focal_px",)),
         )
     return None, ()
 
 
 def _rectify_by_features(ready: Rectified) -> Rectified:
-    """Rectify the pair from feature matches and drop its camera: disparity at infinity is then unknown."""
+    """Rectify the pair from feature matches and drop its camera, as disparity at infinity is then unknown."""
     rectified = rectify_by_features(ready.pair)
     if ready.pair.camera is None:
         return rectified
-    lost = Note("no metres after rectification by features", Remedy("give a calibration", ("calibration",)))
+    lost = Note(
+        "no depth in metres after rectification from feature matches",
+        Remedy("give a calibration", ("calibration",)),
+    )
     return replace(rectified, notes=(*rectified.notes, lost))

@@ -2,9 +2,9 @@
 
 The hidden background is synthesised once per image rather than once per view, so that it is consistent
 between views. From every depth edge, the farther surface continues as far as a camera within one baseline can
-look behind the edge. Each hidden pixel copies the pixel of that surface with the most similar neighbourhood;
-the candidates are next to the sources of its neighbours' colours (Ashikhmin 2001, "Synthesizing natural
-textures").
+look behind the edge. Each hidden pixel copies the pixel of that surface whose neighbourhood is most similar.
+The candidates lie next to the pixels from which the hidden pixel's neighbours were copied (Ashikhmin 2001,
+"Synthesizing natural textures").
 """
 
 import math
@@ -18,11 +18,11 @@ from stereoweave.system.jit import compiled, inlined, kernel
 RIM_PX = 1
 """Within this distance of a depth edge, background pixels may carry the foreground's colour."""
 _PURE_PX = np.float32(1)
-"""Pixels that have a neighbour nearer by more than this are not copied."""
+"""A pixel is not copied if a neighbour's disparity exceeds the pixel's own by more than this."""
 _ALIKE_PX = 2 * SAME_SURFACE_PX
 """Largest disparity difference between a surface and the pixels copied to it."""
 _LOOK_PX = 16
-"""Largest distance of candidates that are not derived from a neighbour's source."""
+"""Largest distance of candidates that are not next to the source of a neighbour's colour."""
 
 
 @kernel
@@ -37,18 +37,18 @@ def uncover(image, disparity_px, nearer_px, other_px, side, hidden_px, colours, 
         other_px: float32 [H, W], the other image's disparity.
         side: -1 for the left image, whose background is uncovered to the left of the foreground and whose
             column x corresponds to x - disparity in the other image; 1 for the right image.
-        hidden_px: float32 [H, W], output: disparity of the hidden background, NOTHING elsewhere.
-        colours: uint8 RGB [H, W, 3], output: written at hidden pixels only.
+        hidden_px: Output, float32 [H, W]: disparity of the hidden background; NOTHING elsewhere.
+        colours: Output, uint8 RGB [H, W, 3]; written at hidden pixels only.
         first: First row of the band; rows above it are not used.
         end: Row after the last row of the band.
     """
     width = disparity_px.shape[1]
-    origins = np.empty((2, width, 2), np.int32)  # source pixels of the colours in this row and the one above
+    origins = np.empty((2, width, 2), np.int32)  # source pixels of the colours in this row and the row above
     borders = np.empty(width, np.int32)  # column of the last visible background pixel before the foreground
     for y in range(first, end):
         _find_hidden(disparity_px[y], other_px[y], side, hidden_px[y], borders)
         for k in range(width):
-            # From the edges inwards, so that the neighbour towards the background is already written.
+            # Go from the edges inwards, so that the neighbour towards the background is already written.
             x = k if side < 0 else width - 1 - k
             origins[y % 2, x, 0], origins[y % 2, x, 1] = y, x
             if hidden_px[y, x] > NOTHING:
@@ -93,7 +93,7 @@ def _copy_example(image, disparity_px, nearer_px, hidden_px, colours, origins, b
     searches = not _can_continue(disparity_px, nearer_px, origins[y % 2, x + side], side, d)
     compared = 7 if searches else 4
     # New candidates: a stretch of the row if the neighbour's source cannot continue, else the mirrored pixel
-    # and a pseudo-random one.
+    # and a pseudo-random pixel.
     for k in range(4 + (_LOOK_PX if searches else 2)):
         if k < 4:  # next to the source of a neighbour's colour
             row, column = y - (k > 0), x + side * _neighbour_offset(k)
@@ -121,7 +121,7 @@ def _copy_example(image, disparity_px, nearer_px, hidden_px, colours, origins, b
 @inlined
 @typing.no_type_check
 def _can_continue(disparity_px, nearer_px, origin, side, d):
-    """Return whether the pixel after the source of a neighbour's colour can be copied to the next pixel."""
+    """Return whether the pixel that follows the source of the neighbour's colour can be copied too."""
     return _is_example(disparity_px, nearer_px, origin[0], origin[1] - side, d)
 
 
@@ -140,7 +140,7 @@ def _is_example(disparity_px, nearer_px, y, x, d):
 def _compare_surroundings(
     image, disparity_px, hidden_px, colours, y, x, at_y, at_x, side, compared, first, enough
 ):
-    """Return the mean squared colour difference between known neighbours of (y, x) and (at_y, at_x)."""
+    """Return the mean squared difference between the known neighbours of (y, x) and those of (at_y, at_x)."""
     width = disparity_px.shape[1]
     total, count = 0.0, 0
     for k in range(compared):
@@ -167,7 +167,7 @@ def _compare_surroundings(
 def _neighbour_offset(k):
     """Return the column offset of neighbour k towards the background.
 
-    Neighbour 0 is beside the pixel, 1 to 3 are in the row above, and those from 4 on are farther along the
-    row.
+    Neighbour 0 is beside the pixel, neighbours 1 to 3 are in the row above, and neighbours 4 and up are
+    farther along the pixel's own row.
     """
     return k - 2 if k > 3 else 1 - (k == 1) - 2 * (k == 3)

@@ -11,17 +11,17 @@ RIM = 0.15
 """Largest support for a surface that appears in one image only, and only in impure pixels."""
 
 WINDOW_REACH_PX = 2
-"""Half size of the alignment window, 5x5 pixels."""
+"""Reach of the alignment window, which has 5x5 pixels, from its centre."""
 LARGEST_STEP_PX = np.float32(1)
 """Largest change that the alignment makes to a disparity."""
 FLAT_LEVELS2 = np.float32(30)
 """Regularisation: mean squared grey-level slope below which a window is too flat to align."""
 DOUBLES_REACH_PX = 12
-"""A doubled object is thin: within this distance on both sides are pixels that are not doubled."""
+"""A doubled object is thin: on both sides, there are pixels within this distance that are not doubled."""
 AGREED_LEVELS = 30
-"""Images agree where they differ by at most this, summed over the channels."""
+"""The images agree where their difference, summed over the channels, is at most this."""
 ALIKE_LEVELS, UNLIKE_LEVELS = 20, 60
-"""Colour differences: at most the first within a surface, at least the second between two surfaces."""
+"""Colour differences: at most the first within a surface, and at least the second between two surfaces."""
 _HALF, _ONE, _LARGEST = np.float32(0.5), np.float32(1), np.float32(255)
 _LEAST = np.float32(1e-9)
 _1, _2, _3 = np.uint32(1), np.uint32(2), np.uint32(3)
@@ -30,10 +30,10 @@ _1, _2, _3 = np.uint32(1), np.uint32(2), np.uint32(3)
 @compiled
 @typing.no_type_check
 def compare_row(left, right, y, row, sums):
-    """Write a row's terms for the alignment, `sums` [3, W], each summed over 5 columns.
+    """Write a row's alignment terms, each summed over 5 columns, to `sums` [3, W].
 
     The terms are the grey-level difference times its derivative with respect to disparity, that derivative
-    squared, and 1. Columns count where both images show the pixel's only surface.
+    squared, and 1. Only columns where both images show the pixel's only surface are counted.
     """
     width = row.front_px.shape[0]
     left_grey, left_slope, right_grey, right_slope = np.empty((4, width), np.float32)
@@ -56,7 +56,7 @@ def compare_row(left, right, y, row, sums):
 @compiled
 @typing.no_type_check
 def align_row(sums, row):
-    """Refine a row's disparities so that the images align, with the terms `sums` [5, 3, W] of 5 rows.
+    """Refine a row's disparities to align the images, using the terms `sums` [5, 3, W] of 5 rows.
 
     This is one Lucas-Kanade step. Without it, matching noise shows as blur, because each image is sampled
     slightly off the surface.
@@ -93,7 +93,7 @@ def _sample_grey_row(side, y, front_px, grey, slope):
 @inlined
 @typing.no_type_check
 def _pad(row, padded):
-    """Write a row as float32, with its end pixels repeated once before and three times after it."""
+    """Write a row as float32 between one copy of its first pixel and three copies of its last pixel."""
     width = row.shape[0]
     for x in range(width):
         padded[x + 1] = row[x]
@@ -173,14 +173,15 @@ def paint_row(left, right, y, row, canvas):
 @compiled
 @typing.no_type_check
 def _resolve_doubles(row, left_colours, right_colours, of_left):
-    """Avoid doubling thin objects that both disparity maps missed: use the image that shows the background.
+    """Use only the image that shows the background where both disparity maps missed a thin object.
 
-    Both images show such an object, but in front of different parts of the background. It is recognised where
-    the images differ between two places at which they agree on one surface, and one of the images continues
-    the colour of that surface. The other image shows the object.
+    Otherwise, the object would be doubled, because the two images show it in front of different parts of the
+    background. Such an object is recognised where the images differ but agree at nearby pixels on both sides,
+    which are on the same surface, and where one image has the colour of that surface. The other image shows
+    the object.
     """
     width = of_left.shape[0]
-    agreed = np.empty(width, np.int32)  # for each column, the last one up to it in which both images agree
+    agreed = np.empty(width, np.int32)  # for each column, the last column up to it where both images agree
     last = -2 * DOUBLES_REACH_PX
     for u in range(width):
         if (

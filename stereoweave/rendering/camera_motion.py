@@ -1,4 +1,4 @@
-"""Warping of a rendered view to a camera that is also moved up and forward."""
+"""Warping of a rendered view to a camera that is moved up and forward."""
 
 import numpy as np
 from jaxtyping import Float
@@ -20,10 +20,10 @@ def move_camera(canvas: Canvas, camera: StereoCamera, offset_px: float, up: floa
     after the motion.
 
     Args:
-        canvas: A view from the line through the cameras, with holes filled.
+        canvas: A view from a position on the line through the cameras, with holes filled.
         camera: The left camera.
-        offset_px: Shift of the view's principal point, to the right, from the left camera's.
-        up: Motion up in the image, in baselines.
+        offset_px: Shift of the view's principal point to the right of the left camera's principal point.
+        up: Upward motion, in baselines.
         forward: Motion towards the scene, in baselines.
     """
     height, width = canvas.surface_px.shape

@@ -17,8 +17,8 @@ from stereoweave.system.jit import compiled, kernel
 def move(image, surface_px, drawn, targets, disparity_px, canvas):
     """Move each pixel (y, x) to the fractional column targets[y, x] of the canvas; the nearest surface wins.
 
-    Colours are interpolated between neighbours on one surface, so that magnified surfaces have no cracks.
-    Pixels on which nothing lands stay impure.
+    Colours are interpolated between neighbours on the same surface, so that magnified surfaces have no
+    cracks. Pixels on which nothing lands stay impure.
 
     Args:
         image: uint8 RGB [H, W, 3].
@@ -42,7 +42,7 @@ def _move_row(image, surface_px, drawn, targets, disparity_px, y, canvas):
         after = min(x + 1, width - 1)
         right_end = x == width - 1 or abs(surface_px[after] - surface_px[x]) > SAME_SURFACE_PX
         begin = targets[x] - 0.5 if left_end else targets[x]
-        # A pixel without a neighbour on its surface reaches half a pixel to either side.
+        # A pixel without a neighbour on its surface extends by half a pixel to either side.
         end = targets[x] + 0.5 if right_end else targets[after]
         stretch = 1.0 if right_end else targets[after] - targets[x]
         if stretch <= 0:
@@ -59,9 +59,9 @@ def _move_row(image, surface_px, drawn, targets, disparity_px, y, canvas):
 @compiled
 @typing.no_type_check
 def _copy(image, surface_px, x, part, colour):
-    """Write the colour between pixel x and the next.
+    """Write the colour at the fraction `part` of the way from pixel x to the next pixel.
 
-    Interpolation is cubic if the four nearest pixels are on one surface, else linear.
+    The interpolation is cubic if the four nearest pixels are on the same surface, else linear.
     """
     width = image.shape[0]
     a, b, c, d = max(x - 1, 0), x, min(x + 1, width - 1), min(x + 2, width - 1)

@@ -1,4 +1,4 @@
-"""Types and kernels shared by the renderer: input images, canvas, splatting, support.
+"""Types and kernels that the renderer's other kernels share: input images, canvas, splatting and support.
 
 Tests compare the kernels with the plain implementation in tests/helpers/plain_rendering.py.
 """
@@ -27,13 +27,13 @@ class Side(typing.NamedTuple):
 
     Attributes:
         image: uint8 RGB [H, W, 3].
-        grey: uint8.
+        grey: Grey levels, uint8.
         disparity_px: float32; column x lands at x + shift * disparity_px + offset_px in the new view.
         nearer_px: float32; largest disparity in the 3x3 window minus the pixel's own.
         shift: -position for the left image, 1 - position for the right one.
         offset_px: Shift of the whole view to the right.
-        nearness: Weight that falls with the distance from the image's camera to the new one; the weights of
-            both images sum to 1.
+        nearness: Weight that falls with the distance from the image's camera to the new camera; the weights
+            of both images sum to 1.
     """
 
     image: np.ndarray
@@ -73,7 +73,7 @@ def empty_canvas(image: np.ndarray) -> Canvas:
 
 
 class SurfaceRow(typing.NamedTuple):
-    """Surfaces in a row of the new view, before it is painted; arrays are float32 [W].
+    """Surfaces in a row of the new view, before the row is painted; arrays are float32 [W].
 
     Attributes:
         front_px: Disparity of the visible surface, or NOTHING.
@@ -97,7 +97,7 @@ _ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
 def splat_row(disparity_px, shift, offset_px, landed_px):
     """Write to landed_px [W] the nearest disparity that lands on each pixel of the new view, or NOTHING.
 
-    Disparity is interpolated linearly between neighbours on one surface, so that slanted and magnified
+    Disparity is interpolated linearly between neighbours on the same surface, so that slanted and magnified
     surfaces have no cracks. Pixels at the edge of a surface reach half a pixel farther.
     """
     width = disparity_px.shape[0]
@@ -135,7 +135,7 @@ def sample_linear(row, x):
     """Sample `row` [W] linearly at the fractional column x, clamped to the border."""
     last = row.shape[0] - 1
     i = math.floor(x)
-    # As floats, because the difference of two uint8 wraps around.
+    # As floats, because the difference of two uint8 values wraps around.
     before = float(row[min(max(i, 0), last)])
     after = float(row[min(max(i + 1, 0), last)])
     return before + (x - i) * (after - before)
@@ -161,7 +161,7 @@ def purity(shift, nearer_px):
 @compiled
 @typing.no_type_check
 def support_in_row(side, y, front_px, support):
-    """Write an image's support for each surface front_px [W] of a row: 0..1, float32.
+    """Write an image's support, float32 in 0..1, for each surface of a row, front_px [W].
 
     The support is interpolated between two pixels, each weighted by `lies_on` and `purity`.
     """

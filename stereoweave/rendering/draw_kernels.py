@@ -17,9 +17,9 @@ _RING = 2 * WINDOW_REACH_PX + 1
 def draw(left, right, confidence, canvas, first, end):
     """Render the canvas rows from `first` up to but not including `end`.
 
-    In a rectified pair all motion is along rows, so surfaces are chosen row by row. Alignment needs the rows
-    within WINDOW_REACH_PX, so painting follows that many rows behind. The few rows in the ring buffer stay in
-    the cache, which makes this three times as fast as running each step over the whole image.
+    In a rectified pair, all motion is along rows, so surfaces are chosen row by row. Alignment needs the rows
+    within WINDOW_REACH_PX, so painting lags that many rows behind. The few rows in the ring buffer stay in
+    the cache; this is three times as fast as running each step over the whole image.
     """
     height, width = canvas.surface_px.shape
     kept = np.empty((5, _RING, width), np.float32)
@@ -43,6 +43,6 @@ def draw(left, right, confidence, canvas, first, end):
 @compiled
 @typing.no_type_check
 def _select_row(kept, y):
-    """Return the slot of a row in the ring buffer."""
+    """Return a row's slot in the ring buffer."""
     i = y % _RING
     return SurfaceRow(kept[0, i], kept[1, i], kept[2, i], kept[3, i], kept[4, i])

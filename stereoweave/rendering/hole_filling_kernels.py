@@ -7,7 +7,7 @@ from stereoweave.rendering.canvas_kernels import NOTHING, SAME_SURFACE_PX
 from stereoweave.system.jit import compiled, kernel
 
 NARROW_PX = 8
-"""Widest hole that is filled with one colour, without texture."""
+"""Largest width of a hole that is filled with one colour, without texture."""
 
 
 @kernel
@@ -20,7 +20,7 @@ def paint_background(hidden_px, colours, shift, offset_px, canvas):
     height, width = hidden_px.shape
     for y in range(height):
         for k in range(width):
-            # Visit the nearest of the pixels that land on one place first, so that the place is painted once.
+            # Visit the nearest of the pixels that land on the same place first, to paint the place only once.
             x = k if shift > 0 else width - 1 - k
             d = hidden_px[y, x]
             if d == NOTHING:
@@ -38,7 +38,7 @@ def paint_background(hidden_px, colours, shift, offset_px, canvas):
 @compiled
 @typing.no_type_check
 def _mix(hidden_px, colours, x, beyond, colour):
-    """Write the colour `beyond` pixels from the hidden pixel x, interpolated with its neighbour."""
+    """Write the colour `beyond` pixels away from the hidden pixel x, interpolated with its neighbour."""
     beside = x + (1 if beyond > 0 else -1)
     part = abs(beyond)
     if beside < 0 or beside >= hidden_px.shape[0] or abs(hidden_px[beside] - hidden_px[x]) > SAME_SURFACE_PX:
@@ -51,11 +51,11 @@ def _mix(hidden_px, colours, x, beyond, colour):
 @kernel
 @typing.no_type_check
 def fill(canvas):
-    """Fill every run of pixels that are still impure, from the farther of the two surfaces beside it.
+    """Fill each run of pixels that are still impure from the farther of the two surfaces beside the run.
 
-    A narrow run gets the mean colour of that surface, which has the least error. A wide run gets its mirrored
-    texture, as does a run at the image border, which has a surface on one side only. As in
-    `paint_background`, impure pixels farther away than that surface keep their colour.
+    A narrow run gets the surface's mean colour, because this has the least error. A wide run gets the
+    surface's mirrored texture, and so does a run at the image border, which has a surface on one side only.
+    As in `paint_background`, impure pixels farther away than that surface keep their colour.
     """
     surface_px, pure, drawn = canvas.surface_px, canvas.pure, canvas.drawn
     height, width = pure.shape
@@ -85,7 +85,7 @@ def fill(canvas):
 def _average_beside(canvas, y, column, inwards):
     """Return the mean colour of the surface at (y, column).
 
-    The mean is over two columns and three rows, of which row y counts twice.
+    The mean is taken over two columns and three rows, where row y counts twice.
     """
     height, width = canvas.pure.shape
     here_px = canvas.surface_px[y, column]
@@ -104,7 +104,10 @@ def _average_beside(canvas, y, column, inwards):
 @compiled
 @typing.no_type_check
 def _fill_pixel(canvas, y, u, source, colour, mirrors):
-    """Fill a pixel from its mirror image about `source` if both are on one surface, else with `colour`."""
+    """Fill a pixel with the colour of its mirror image about `source`, or with `colour`.
+
+    The mirror image is used if `mirrors` is set and it is on the same surface as `source`.
+    """
     width = canvas.pure.shape[1]
     mirrored = min(max(2 * source - u, 0), width - 1)
     apart_px = abs(canvas.surface_px[y, mirrored] - canvas.surface_px[y, source])

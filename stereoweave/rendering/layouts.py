@@ -1,8 +1,8 @@
 """Output layouts for 3-D viewers and displays, and animations.
 
-A layout composes one image, uint8 RGB, from the views of a `Renderer`; a video applies it to every frame. An
-animation is a sequence of views. The left and right eye are the renderer's positions 0 and 1, with its
-strength and convergence.
+A layout composes one image, uint8 RGB, from the views of a `Renderer`; in a video, every frame is such an
+image. An animation is a sequence of views. The left eye is at the renderer's position 0 and the right eye at
+position 1; the renderer's strength and convergence apply.
 """
 
 import math
@@ -26,7 +26,7 @@ from stereoweave.stereo import Estimate, StereoPair
 # Viewers of a quilt move their heads much farther than the cameras are apart, so a quilt needs a wide range
 # of positions. The outer views may consist mostly of filled holes, but are seen least.
 _FAN = (-0.5, 1.5)
-# The largest quilt that Looking Glass recommends (for its 32 inch and 65 inch displays).
+# Side of the largest quilt that Looking Glass recommends (for its 32-inch and 65-inch displays).
 _QUILT_SIDE_PX = 8192
 _MOST_VIEWS = 200
 _SHEET_SIDE = 3
@@ -35,14 +35,14 @@ _SHEET_SIDE = 3
 _GREY = (0.299, 0.587, 0.114)
 _RED, _GREEN, _BLUE = np.eye(3)
 _NOTHING = (0.0, 0.0, 0.0)
-# Red-cyan anaglyphs: 3x3 RGB matrices of the left and the right view, whose products are added.
+# Red-cyan anaglyphs: 3x3 RGB matrices for the left and for the right view; the two products are added.
 _ANAGLYPHS = {
     "grey": ([_GREY, _NOTHING, _NOTHING], [_NOTHING, _GREY, _GREY]),
     "colour": ([_RED, _NOTHING, _NOTHING], [_NOTHING, _GREEN, _BLUE]),
     "half_colour": ([_GREY, _NOTHING, _NOTHING], [_NOTHING, _GREEN, _BLUE]),
     # E. Dubois, "Conversion of a Stereo Pair to Anaglyph with the Least-Squares Projection Method", 2009;
-    # method in ICASSP 2001. It is derived for linear light; like most programs and his own Photoshop recipe,
-    # this applies the matrices to the stored values.
+    # method in ICASSP 2001. The matrices are derived for linear light. Like most programs and Dubois's own
+    # Photoshop recipe, we apply them to the stored values.
     "dubois": (
         [
             (0.456100, 0.500484, 0.176381),
@@ -63,9 +63,9 @@ class LayoutOptions:
     """Options of a layout.
 
     Attributes:
-        columns, rows: Number of views in a row and in a column of a quilt.
-        range_px: Disparities of black and white in rgbd; default: the image's own range. A video uses one
-            range for all frames, to avoid flicker.
+        columns, rows: Numbers of columns and of rows of views in a quilt.
+        range_px: Disparities shown as black and as white in rgbd; default: the image's own range. A video
+            uses one range for all frames, to avoid flicker.
     """
 
     columns: int = 8
@@ -91,7 +91,7 @@ class Layout:
 
     Attributes:
         compose: Function that returns the image, uint8 RGB.
-        positions: The outermost positions of its views.
+        positions: Outermost positions of the layout's views.
         converged: Whether views are overlaid or compared in place, so the middle of the scene should have no
             parallax.
         mark: File name suffix by which viewers detect the layout.
@@ -108,10 +108,10 @@ class Animation:
     """A loop of views.
 
     Attributes:
-        positions: Position of each frame of one turn.
+        positions: Positions of the frames of one turn.
         frame_ms: Duration of a frame; a multiple of 10, the unit of GIF.
         mp4_turns: Number of turns in an MP4 file, which players do not loop.
-        converged: As in `Layout`.
+        converged: See `Layout`.
     """
 
     positions: tuple[float, ...]
@@ -120,45 +120,51 @@ class Animation:
     converged: bool = True
 
     def turns(self, path: str | Path) -> int:
-        """Return the number of turns in a file with this ending."""
+        """Return the number of turns to write to a file, according to its extension."""
         return self.mp4_turns if check_animation_ending(path) == ".mp4" else 1
 
 
 def render_views(renderer: Renderer, positions: Iterable[float]) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
-    """Render the views from these positions lazily, uint8 RGB [H, W, 3]."""
+    """Lazily render the views from these positions as uint8 RGB [H, W, 3]."""
     return (renderer.view(position).image for position in positions)
 
 
 def side_by_side(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
-    """Return both eyes' views side by side, the left eye's on the left, at twice the width."""
+    """Return both eyes' views side by side at full width, with the left eye's on the left."""
     return np.hstack(_render_eyes(renderer))
 
 
 def side_by_side_half(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
-    """Return both eyes' views side by side, each at half width; an odd width repeats its last column."""
+    """Return both eyes' views side by side, each at half width, with the left eye's on the left.
+
+    If the width is odd, the last column is repeated.
+    """
     return np.hstack([_halve(eye, axis=1) for eye in _render_eyes(renderer)])
 
 
 def crossed(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
-    """Return both eyes' views side by side, the right eye's on the left, for cross-eyed viewing."""
+    """Return both eyes' views side by side, with the right eye's on the left, for cross-eyed viewing."""
     return np.hstack(_render_eyes(renderer)[::-1])
 
 
 def top_bottom(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
-    """Return both eyes' views one above the other, the left eye's on top, at twice the height."""
+    """Return both eyes' views one above the other at full height, with the left eye's on top."""
     return np.vstack(_render_eyes(renderer))
 
 
 def top_bottom_half(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
-    """Return both eyes' views, the left eye's on top, each at half height.
+    """Return both eyes' views one above the other, each at half height, with the left eye's on top.
 
-    An odd height repeats its last row.
+    If the height is odd, the last row is repeated.
     """
     return np.vstack([_halve(eye, axis=0) for eye in _render_eyes(renderer)])
 
 
 def make_anaglyph(kind: str) -> Callable[[Renderer, LayoutOptions], np.ndarray]:
-    """Return the `compose` function of a red-cyan anaglyph, red for the left eye; see `_ANAGLYPHS`."""
+    """Return the `compose` function of a red-cyan anaglyph, with red for the left eye.
+
+    `kind` is a key of `_ANAGLYPHS`.
+    """
     shares = [np.array(matrix, np.float32) for matrix in _ANAGLYPHS[kind]]
 
     def compose(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
@@ -166,16 +172,16 @@ def make_anaglyph(kind: str) -> Callable[[Renderer, LayoutOptions], np.ndarray]:
             cv2.transform(eye.astype(np.float32), matrix)
             for eye, matrix in zip(_render_eyes(renderer), shares, strict=True)
         )
-        # Round and clip the sum; neither eye's part may be clipped alone.
+        # Round and clip only the sum, not each eye's part.
         return cv2.add(left, right, dtype=cv2.CV_8U)
 
     return compose
 
 
 def rgbd(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the left image beside its disparity in grey, where white is near, at twice the width.
+    """Return the left image beside its disparity as a grey image of the same size, where white is near.
 
-    Strength and convergence have no effect: RGB-D displays render views themselves.
+    Strength and convergence have no effect, because RGB-D displays render the views themselves.
     """
     disparity_px = renderer.estimate.disparity_px
     low_px, high_px = choices.range_px or find_colour_range_px(disparity_px)
@@ -185,10 +191,10 @@ def rgbd(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3
 
 
 def quilt(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
-    """Return a quilt: rows of views from left to right, from the bottom left to the top right.
+    """Return a quilt: views in rows, ordered from the bottom left to the top right.
 
-    Views are scaled down if a side of the quilt would exceed 8192 px. Source: Looking Glass's quilt
-    definition.
+    Views are scaled down if a side of the quilt would exceed 8192 px. Source: Looking Glass's definition of a
+    quilt.
     """
     height, width = renderer.pair.left.shape[:2]
     columns, rows = choices.columns, choices.rows
@@ -202,12 +208,12 @@ def contact_sheet(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarra
 
 
 def _swing_positions(count: int) -> tuple[float, ...]:
-    """Return positions from 0 to 1 and back along a cosine, slow at both ends."""
+    """Return `count` positions from 0 to 1 and back along a cosine, which is slow at both ends."""
     return tuple((0.5 - 0.5 * np.cos(2 * np.pi * np.arange(count) / count)).tolist())
 
 
 # VR players detect LR, TB and half in file names. The marks of full and crossed layouts follow iw3, the most
-# used conversion tool; a quilt's follows Looking Glass.
+# widely used conversion tool; the mark of a quilt follows Looking Glass.
 LAYOUTS: dict[str, Layout] = {
     "side_by_side": Layout(compose=side_by_side, mark="_LRF_Full_SBS"),
     "side_by_side_half": Layout(compose=side_by_side_half, mark="_half_LR"),
@@ -226,20 +232,21 @@ ANIMATIONS: dict[str, Animation] = {
     "sweep": Animation(positions=_swing_positions(80), frame_ms=40, mp4_turns=1),
     "wiggle": Animation(positions=_swing_positions(12), frame_ms=60, mp4_turns=5),
 }
-# Layouts that a file's ending determines.
+# Layouts that are determined by the file extension.
 _LAYOUT_BY_ENDING = {".mpo": "side_by_side", ".jps": "crossed"}
-# No chroma subsampling, because stereo pictures are magnified and compared by two eyes.
+# No chroma subsampling, because stereo pictures are magnified and compared by both eyes.
 _FINE = {"quality": 95, "subsampling": 0}
-# JPEG marker APP3 and its length; the identifier; the length of the next four bytes: separation 0, right eye
-# first, side by side, stereo; no comment. Source: ExifTool's table of JPS tags.
+# The JPEG marker APP3, the segment's length, the identifier, the length of the next four bytes, these four
+# bytes (separation 0, right eye first, side by side and stereo) and the length of an empty comment. Source:
+# ExifTool's table of JPS tags.
 _JPS_SEGMENT = b"\xff\xe3\x00\x12_JPSJPS_\x00\x04\x00\x00\x02\x01\x00\x00"
 
 
 def choose_layout(path: str | Path, name: str | None) -> str | None:
-    """Return the layout of an output file, given by name or by the file's ending; None for a single view.
+    """Return the layout of an output file, given by name or by the file extension; None for a single view.
 
     Raises:
-        StereoweaveError: The layout is unknown, or does not fit the file's ending.
+        StereoweaveError: The layout is unknown or does not match the file extension.
     """
     if name is not None and name not in LAYOUTS | ANIMATIONS:
         raise StereoweaveError(
@@ -249,7 +256,7 @@ def choose_layout(path: str | Path, name: str | None) -> str | None:
     held = _LAYOUT_BY_ENDING.get(ending)
     if held is not None:
         if name not in (None, held):
-            raise StereoweaveError(f"{path}: expected the layout {held} for this file ending, found {name}")
+            raise StereoweaveError(f"{path}: expected the layout {held} for this extension, found {name}")
         return held
     if name in ANIMATIONS:
         check_animation_ending(path)
@@ -259,21 +266,21 @@ def choose_layout(path: str | Path, name: str | None) -> str | None:
 
 
 def check_positions(positions: Iterable[float], strength: float) -> None:
-    """Raise a StereoweaveError if one of these positions cannot be rendered at this strength."""
+    """Raise a StereoweaveError if a view cannot be rendered from one of these positions at this strength."""
     for position in positions:
         seen_from = 0.5 + strength * (position - 0.5)
         if not FIRST_POSITION <= seen_from <= LAST_POSITION:
-            by_strength = "" if strength == 1 else f", position {position:g} at strength {strength:g}"
+            by_strength = "" if strength == 1 else f" (position {position:g} at strength {strength:g})"
             raise StereoweaveError(
-                f"expected {FIRST_POSITION:g} to {LAST_POSITION:g} (0 is the left camera, 1 the right), "
-                f"got {seen_from:g}{by_strength}",
+                f"expected {FIRST_POSITION:g} to {LAST_POSITION:g} (0 is the left camera and 1 the right "
+                f"one), got {seen_from:g}{by_strength}",
                 setting="position",
             )
 
 
 def median_disparity_px(estimate: Estimate) -> float:
-    """Return the median disparity in px, weighted by confidence: the middle of the scene."""
-    # Weights are above 0, so that even a pair without any confidence has a median.
+    """Return the confidence-weighted median disparity in px, which is taken as the middle of the scene."""
+    # Weights are positive, so that even a pair with a confidence of 0 everywhere has a median.
     weights = np.maximum(estimate.confidence, 1e-6)
     return float(np.quantile(estimate.disparity_px, 0.5, weights=weights, method="inverted_cdf"))
 
@@ -281,8 +288,8 @@ def median_disparity_px(estimate: Estimate) -> float:
 def add_mark(path: str | Path, name: str, pair: StereoPair, choices: LayoutOptions) -> Path:
     """Return a path whose file name ends in the suffix by which viewers detect the layout.
 
-    A quilt's suffix gives columns, rows, and the aspect ratio of one view: view_qs8x6a0.75.png. An .mpo or
-    .jps file needs no suffix.
+    A quilt's suffix gives the numbers of columns and rows and the aspect ratio of one view, as in
+    view_qs8x6a0.75.png. An .mpo or .jps file needs no suffix.
     """
     path = Path(path)
     if path.suffix.lower() in _LAYOUT_BY_ENDING:
@@ -294,10 +301,10 @@ def add_mark(path: str | Path, name: str, pair: StereoPair, choices: LayoutOptio
 
 
 def write_picture(path: str | Path, picture: UInt8[np.ndarray, "h w 3"]) -> None:
-    """Write a layout's image in the format of the path's ending.
+    """Write a layout's image in the format given by the file extension.
 
-    An .mpo file, the format of 3-D cameras, stores the halves of `side_by_side` as two pictures, the left
-    eye's first. A .jps file is a JPEG of `crossed` with a JPS header.
+    An .mpo file, the format of 3-D cameras, stores the two halves of a `side_by_side` image as separate
+    pictures, with the left eye's first. A .jps file is a JPEG of a `crossed` image with a JPS header.
     """
     ending = Path(path).suffix.lower()
     if ending not in _LAYOUT_BY_ENDING:
@@ -317,7 +324,10 @@ def _render_eyes(renderer: Renderer) -> list[UInt8[np.ndarray, "h w 3"]]:
 
 
 def _halve(eye: UInt8[np.ndarray, "h w 3"], axis: int) -> UInt8[np.ndarray, "h2 w2 3"]:
-    """Halve an image along an axis by averaging neighbours; an odd side repeats its last row or column."""
+    """Halve an image along an axis by averaging neighbouring pixels.
+
+    If the side along this axis is odd, the last row or column is repeated.
+    """
     odd = [(0, side % 2 * (index == axis)) for index, side in enumerate(eye.shape)]
     even = np.pad(eye, odd, "edge")
     height, width = even.shape[:2]
@@ -328,7 +338,7 @@ def _halve(eye: UInt8[np.ndarray, "h w 3"], axis: int) -> UInt8[np.ndarray, "h2 
 def _render_tiles(
     renderer: Renderer, columns: int, rows: int, smaller: float
 ) -> UInt8[np.ndarray, "rows h columns w 3"]:
-    """Render tiles of evenly spaced views in reading order, each scaled down by the factor `smaller`."""
+    """Render evenly spaced views as tiles in reading order, each scaled down by the factor `smaller`."""
     height, width = (max(1, int(side / smaller)) for side in renderer.pair.left.shape[:2])
     tiles = np.empty((rows, height, columns, width, 3), np.uint8)
     for index, view in enumerate(render_views(renderer, np.linspace(*_FAN, rows * columns).tolist())):

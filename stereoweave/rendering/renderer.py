@@ -1,4 +1,4 @@
-"""View synthesis: images from virtual cameras on the line through the two real ones, or beside it."""
+"""View synthesis: images from virtual cameras on or beside the line through the two real cameras."""
 
 import math
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 FIRST_POSITION, LAST_POSITION = -1.0, 2.0
 _MOST_THREADS = 4
 _LEAST_NEARNESS = 1e-3
-# Rows per band when background is uncovered, independent of the number of threads.
+# Rows per band when background is uncovered. Independent of the number of threads, as results must be.
 _BAND_ROWS = 60
 _FARTHEST_MOVE = 1.0
 # Percentile of the disparity that is taken as infinitely far; matching errors lie below it.
@@ -30,12 +30,13 @@ _FAR_PERCENT = 1
 
 
 class Renderer:
-    """Renderer of any number of views from one pair and its estimate; shared data is computed once.
+    """Renderer of any number of views of one pair; the data that all views share is computed once.
 
     Attributes:
         pair: The two images, and their camera if known.
         estimate: The pair's estimate.
-        strength: Factor on the baseline about its middle: position p is seen from 0.5 + strength * (p - 0.5).
+        strength: Factor that scales the baseline about its middle: position p is seen from
+            0.5 + strength * (p - 0.5).
         convergence_px: Disparity of the plane that stays in place in all views; from -width to width.
     """
 
@@ -62,12 +63,12 @@ class Renderer:
         self._confidence = np.require(estimate.confidence, np.float32, ["C", "W"])
 
     def view(self, position: float, *, up: float = 0.0, forward: float = 0.0) -> View:
-        """Render the view from a position: 0 is the left camera, 1 the right one; see `render`.
+        """Render the view from a position, where 0 is the left camera and 1 the right one; see `render`.
 
         Args:
-            position: -1 to 2 after `strength` is applied.
-            up: Distance above the line through the cameras, in baselines; -1 to 1.
-            forward: Distance from that line towards the scene, in baselines; -1 to 1.
+            position: Position from -1 to 2, after `strength` is applied.
+            up: Distance above the line through the cameras, in baselines; from -1 to 1.
+            forward: Distance from that line towards the scene, in baselines; from -1 to 1.
         """
         check_number("position", position)
         position = 0.5 + self.strength * (position - 0.5)
@@ -91,8 +92,8 @@ class Renderer:
         from stereoweave.rendering.draw_kernels import draw  # Numba takes half a second to import
         from stereoweave.rendering.hole_filling_kernels import fill, paint_background
 
-        # The square root averages both images more, which lowers noise: +0.03 dB on rendered views, +0.1 dB
-        # on Venus.
+        # The square root makes the weights of both images more equal, which lowers noise: +0.03 dB on
+        # rendered views and +0.1 dB on Venus.
         shares = abs(1 - position) ** 0.5, abs(position) ** 0.5
         tables = self._looks.tables(position) if self._looks else (None, None)
         colours = [_recolour(side.image, table) for side, table in zip(self._sides, tables, strict=True)]
@@ -101,7 +102,7 @@ class Renderer:
                 **colour,
                 shift=end - position,
                 offset_px=(position - 0.5) * self.convergence_px,
-                # Not 0: some surfaces are seen by the other camera only.
+                # Not 0, because some surfaces are seen by the more distant camera only.
                 nearness=max(share / sum(shares), _LEAST_NEARNESS),
             )
             for side, colour, end, share in zip(self._sides, colours, (0, 1), shares, strict=True)
@@ -110,21 +111,21 @@ class Renderer:
         work = partial(draw, left, right, self._confidence, canvas)
         in_bands(work, len(canvas.image), self._threads, self._threads)
         if not 0 <= position <= 1:
-            # Between the cameras, holes are a few pixels wide: `fill` alone is faster and as good.
+            # Between the cameras, holes are only a few pixels wide: `fill` alone is faster and as good.
             hidden = self._find_background(right=position > 1)
             paint_background(*hidden, (right if position > 1 else left).shift, left.offset_px, canvas)
         fill(canvas)
         return canvas
 
     def _find_background(self, right: bool) -> "HiddenBackground":
-        """Return the background seen by neither camera but visible from beyond one of them; it is cached."""
+        """Return the background that neither camera sees but that is visible from beyond one of them."""
         if right not in self._hidden:
             self._hidden[right] = _uncover_background(self._sides, right, self._threads)
         return self._hidden[right]
 
 
 class HiddenBackground(NamedTuple):
-    """Background that neither camera sees, at an input image's pixels; see `background_kernels.uncover`."""
+    """Background that neither camera sees, on an input image's grid; see `background_kernels.uncover`."""
 
     disparity_px: np.ndarray
     colours: np.ndarray
@@ -143,33 +144,34 @@ def render(  # noqa: PLR0913 - the options of one view
     forward: float = 0.0,
     camera: StereoCamera | None = None,
 ) -> View:
-    """Render the view from a position on the line through the two cameras, or beside it, from both images.
+    """Render the view from a position on or beside the line through the two cameras, using both images.
 
     Both disparity maps are splatted to the new view; the nearer surface wins. Each pixel samples both images
     at its surface. An image's weight depends on the distance to its camera and on whether its own disparity
-    agrees, which it does not where the camera's line of sight is blocked. Where the two maps contradict each
-    other, their confidence and the similarity of the images decide. Holes, which neither camera sees, are
-    filled from their farther side. Differences in exposure and colour are removed: the view has the colours
-    of the left image at position 0, those of the right image at 1, and a blend in between.
+    agrees; where the camera's line of sight is blocked, its disparity is that of a nearer surface. Where the
+    two maps contradict each other, the confidence and the similarity of the images decide. Holes, which
+    neither camera sees, are filled from their farther side. Differences in exposure and colour are removed:
+    the view has the colours of the left image at position 0, those of the right image at position 1, and a
+    blend in between.
 
     To render many views of one pair, use `Renderer`.
 
     Args:
         left: Left image, uint8 RGB [H, W, 3].
-        right: Right image, of the same size.
+        right: Right image of the same size.
         estimate: The pair's estimate (`stereoweave.estimate`).
-        position: 0 is the left camera, 1 the right one; -1 to 2.
+        position: Position from -1 to 2; 0 is the left camera and 1 the right one.
         threads: Number of threads; at most four are used. Default: all cores.
-        strength: Factor on the baseline about its middle, as in `Renderer`.
+        strength: Factor that scales the baseline about its middle, as in `Renderer`.
         convergence_px: Disparity of the plane that stays in place in all views.
-        up: Distance above the line through the cameras, in baselines; -1 to 1.
-        forward: Distance from that line towards the scene, in baselines; -1 to 1.
-        camera: Focal length, principal point and doffs for `up` and `forward`. Default: a focal length equal
-            to the image width.
+        up: Distance above the line through the cameras, in baselines; from -1 to 1.
+        forward: Distance from that line towards the scene, in baselines; from -1 to 1.
+        camera: Camera whose focal length, principal point and doffs `up` and `forward` use. Default: a camera
+            whose focal length is the image width.
 
     Returns:
-        The view, of the images' size; `drawn` is False in filled holes. The view from 0 or 1 is the image
-        itself.
+        The view, which has the same size as the images; `drawn` is False in filled holes. The view from
+        position 0 or 1 is the image itself.
 
     Raises:
         ValueError: The sizes differ, or a number is out of range.
@@ -185,7 +187,7 @@ def check_position(position: float, *, up: float = 0.0, forward: float = 0.0) ->
         check_number(name, value)
     if not FIRST_POSITION <= position <= LAST_POSITION:
         raise StereoweaveError(
-            f"expected {FIRST_POSITION} to {LAST_POSITION} (0 is the left camera, 1 the right), "
+            f"expected {FIRST_POSITION} to {LAST_POSITION} (0 is the left camera and 1 the right one), "
             f"got {position}",
             setting="position",
         )
@@ -204,7 +206,7 @@ def _check_shifts(strength: float, convergence_px: float, pair: StereoPair) -> N
     width = pair.left.shape[1]
     if not abs(convergence_px) <= width:
         raise StereoweaveError(
-            f"expected -{width} to {width} px, the picture's width, got {convergence_px}",
+            f"expected -{width} to {width} px (the picture's width), got {convergence_px}",
             setting="convergence_px",
         )
 
@@ -230,7 +232,7 @@ def _make_side(image: UInt8[np.ndarray, "h w 3"], disparity_px: Float[np.ndarray
 def _recolour(
     image: UInt8[np.ndarray, "h w 3"], table: Float[np.ndarray, "256 3"] | None
 ) -> dict[str, np.ndarray]:
-    """Return a side's image and grey levels after recolouring with a table; empty without a table."""
+    """Return a side's image and grey levels, recoloured with a table; an empty dict if there is no table."""
     if table is None:
         return {}
     coloured = recolour(image, table)
@@ -240,7 +242,7 @@ def _recolour(
 def _assume_camera(estimate: Estimate) -> StereoCamera:
     """Return a camera with a horizontal field of view of 53 degrees and a centred principal point.
 
-    Negative disparities mean converged cameras; the lowest disparities are then taken as infinitely far.
+    Negative disparities mean that the cameras converge; the lowest ones are then taken as infinitely far.
     """
     height, width = estimate.disparity_px.shape
     return StereoCamera(
@@ -253,7 +255,7 @@ def _assume_camera(estimate: Estimate) -> StereoCamera:
 
 
 def _uncover_background(sides: "Sequence[Side]", right: bool, threads: int) -> HiddenBackground:
-    """Reconstruct the background behind the foreground of one image, for views from beyond its camera."""
+    """Reconstruct the background behind one image's foreground, for views from beyond that image's camera."""
     from stereoweave.rendering.background_kernels import uncover
 
     own, other = sides[right], sides[not right]

@@ -24,14 +24,15 @@ def synthesize(  # noqa: PLR0913 - all but the first three are optional
 
     Args:
         left: Left image, uint8 RGB [H, W, 3].
-        right: Right image, of the same size.
-        position: 0 is the left camera, 1 the right one; -1 to 2.
-        model: See `estimate`. The default is the accurate model: a new view shows every error at an edge.
+        right: Right image of the same size.
+        position: Position from -1 to 2; 0 is the left camera and 1 the right one.
+        model: See `estimate`. The default is the accurate model, because a new view shows every error at an
+            edge.
         threads: Number of threads; default: all cores.
         provider: See `estimate`.
 
     Returns:
-        The view, of the images' size; `drawn` is False in filled holes.
+        The view, which has the same size as the images; `drawn` is False in filled holes.
 
     Raises:
         ValueError: See `estimate` and `render`. The position is checked before matching.

@@ -18,7 +18,7 @@ from stereoweave.system.jit import compiled, inlined
 NOISE_LEVELS = 10.0
 """Noise in the difference between the images, summed over the channels, when two surfaces are compared."""
 PRIOR = 0.3
-"""Weight of a disparity with confidence 0; one with confidence 1 weighs about four times as much."""
+"""Weight of a disparity with confidence 0; a disparity with confidence 1 has about four times this weight."""
 
 
 @compiled
@@ -26,7 +26,7 @@ PRIOR = 0.3
 def choose_row(left, right, confidence, y, landed_left, landed_right, row):
     """Write the visible surface of every pixel in a row; where there are two, write both and their shares.
 
-    A pixel has two surfaces where the maps contradict each other, and where a nearer surface ends within it.
+    A pixel has two surfaces where the maps contradict each other or a nearer surface ends within the pixel.
     """
     front_px, back_px = row.front_px, row.back_px
     width = front_px.shape[0]
@@ -86,7 +86,7 @@ def _column(shift, offset_px, u, d):
 def _find_left_share(left, right, confidence, y, u, a, b):
     """Return the share, 0..1, of the left map's surface where the maps disagree.
 
-    The right map's surface has the rest. Their disparities are a and b.
+    The right map's surface has the rest. The disparities of the two surfaces are a and b.
     """
     gap_a_px = _find_gap_px(right, y, u, a)
     gap_b_px = _find_gap_px(left, y, u, b)
@@ -97,8 +97,8 @@ def _find_left_share(left, right, confidence, y, u, a, b):
         return 0.0
     trust_a = sample_linear(confidence[y], _column(left.shift, left.offset_px, u, a))
     trust_b = sample_linear(confidence[y], _column(left.shift, left.offset_px, u, b))
-    # Confidence refers to the left map, which may differ from b: a nearer surface says nothing about b, a
-    # farther one contradicts it.
+    # Confidence refers to the left map, which may differ from b: a nearer surface says nothing about b, and a
+    # farther surface contradicts b.
     if gap_b_px > SAME_SURFACE_PX:
         trust_b = 0.5
     elif gap_b_px < -SAME_SURFACE_PX:
@@ -117,7 +117,7 @@ def _find_left_share(left, right, confidence, y, u, a, b):
 def _find_gap_px(side, y, u, d):
     """Return an image's disparity minus d at the column that corresponds to u; 0 outside the image.
 
-    Of the two pixels at that fractional column, the one whose disparity is closer to d counts.
+    Of the two pixels beside that fractional column, the one whose disparity is closer to d counts.
     """
     last = side.disparity_px.shape[1] - 1
     x = _column(side.shift, side.offset_px, u, d)

@@ -20,15 +20,15 @@ ERRORS: dict[str, tuple[dict[str, str], dict[str, Any]]] = {
     "do not resemble each other; give two files, left and right; or choose one of "
     f"{LAYOUTS} (“Layout of a single file”)": ({"left": "left.png"}, {}),
     "“Layout of a single file”: expected one picture that holds both views, found two, left.png and "
-    "right.png; leave it out, and give the left one first": (PAIR, {"layout": "crossed"}),
+    "right.png; omit this setting, and give the left picture first": (PAIR, {"layout": "crossed"}),
     "turned.yml: expected a calibration of rectified pictures, found lenses with distortion; rectify the "
     "pair with it (“Rectify the pair”)": ({**PAIR, "calibration": "turned.yml"}, {}),
-    "metres: expected a baseline in addition to the focal length, found none; give the baseline (“Baseline, "
-    "mm”)": (
+    "metres: expected a baseline besides the focal length, found none in EXIF; give the baseline "
+    "(“Baseline, mm”)": (
         PAIR,
         {"focal": 500},
     ),
-    "metres: expected a focal length in EXIF in addition to the baseline, found none; give the focal length "
+    "metres: expected a focal length besides the baseline, found none in EXIF; give the focal length "
     "(“Focal length, px”)": (PAIR, {"baseline": 100}),
     "“Rectify the pair”: expected at least 40 feature matches that agree on the camera positions, "
     "found 0 of 0 matches; photograph a scene with more texture and with more overlap; or give a "
@@ -42,7 +42,8 @@ NOTES: dict[str, tuple[dict[str, str], dict[str, Any]]] = {
         {"left": "both.png"},
         {},
     ),
-    "no metres after rectification by features; give a calibration (“Calibration file, for metres”)": (
+    "no depth in metres after rectification from feature matches; give a calibration (“Calibration file, for "
+    "metres”)": (
         PAIR,
         {"focal": 600, "baseline": 100, "rectify": True},
     ),

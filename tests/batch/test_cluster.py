@@ -414,7 +414,7 @@ def test_another_runs_destination_and_an_empty_source_are_refused(engine, tmp_pa
     other = write_pairs(tmp_path / "other", ["00"])
     with pytest.raises(StereoweaveError, match=r"batch.json: expected source = .*other.*, found .*pairs"):
         run_cluster(other, out, JOB, engine)
-    with pytest.raises(StereoweaveError, match=r"other: expected a new folder, or one with a batch.json"):
+    with pytest.raises(StereoweaveError, match=r"other: expected an empty folder or one with a batch.json"):
         run_cluster(source, other, JOB, engine)
     with pytest.raises(StereoweaveError, match="none: expected a folder, found no such folder"):
         run_cluster(tmp_path / "none", tmp_path / "new", JOB, engine)

@@ -291,7 +291,7 @@ def test_another_job_or_an_unrelated_folder_is_refused_before_processing_starts(
     ):
         run_quietly(folder, out, job)
     with pytest.raises(
-        StereoweaveError, match="expected a new folder, or one with a batch.json, found left in"
+        StereoweaveError, match="expected an empty folder or one with a batch.json, found one with left"
     ):
         run_quietly(folder, folder)
     with pytest.raises(StereoweaveError, match="nonsense"):
@@ -335,6 +335,6 @@ def test_the_command_takes_a_list_and_writes_reports_only_on_request(tmp_path, c
     assert main([*words, str(tmp_path / "reports"), "--write", "report.html"]) == 1
     assert (tmp_path / "reports" / "quay" / "report.html").exists()
     assert main([*words, str(out), "--left", "*.png"]) == 2
-    assert "found patterns with a list; give exactly one of them (--left, --right, --list)" in (
+    assert "found patterns and a list; give exactly one of them (--left, --right, --list)" in (
         capsys.readouterr().err
     )

@@ -59,9 +59,9 @@ def test_a_hostile_calibration_is_refused_at_once_in_one_short_line(name, tmp_pa
 @pytest.mark.parametrize("text_of", [yaml_of, json_of, xml_of])
 def test_a_file_of_too_many_values_says_which_to_leave_out(text_of, tmp_path):
     (tmp_path / "calib").write_text(text_of(RIG | {"image_points": [1] * 12_000}))
-    assert "more than 10000 values; leave out entries other than the cameras', such as image_points" in (
-        refusal(tmp_path / "calib")
-    )
+    message = refusal(tmp_path / "calib")
+    text = "more than 10000 values; remove entries that do not describe the cameras, such as image_points"
+    assert text in message
 
 
 @pytest.mark.parametrize("name", HARMLESS)
@@ -130,4 +130,4 @@ def test_values_may_be_nested_20_deep_and_no_deeper(text_of, nested, tmp_path):
         assert read_rig(path).baseline_m == 0.1
         value = nested.format(value)
     path.write_text(text_of(RIG | {"more": nested.format(value)}))
-    assert "nested more than 20 deep" in refusal(path)
+    assert "nested more than 20 levels deep" in refusal(path)

@@ -83,8 +83,8 @@ def test_every_matcher_has_every_number_and_both_plots_are_written(sets, tmp_pat
 @pytest.mark.parametrize(
     ("options", "fragments"),
     [
-        ("--plot time.words", ["time.words: expected a picture file ending", "'.words'"]),
-        ("--sparsification words", ["words: expected a picture file ending"]),
+        ("--plot time.words", ["time.words: expected a picture file extension", "'.words'"]),
+        ("--sparsification words", ["words: expected a picture file extension"]),
         ("--dataset words", ["dataset: expected one of", "'words'"]),
         ("--dataset kitti2015", ["expected a dataset folder"]),
         ("--cluster 127.0.0.1:1", ["127.0.0.1:1: expected the head of a Ray cluster"]),
@@ -191,6 +191,6 @@ def test_a_plot_without_matplotlib_names_the_extra(tmp_path):
     )
     assert done.returncode == 2
     (line,) = done.stderr.splitlines()
-    assert "a plot needs matplotlib, found no module matplotlib" in line
+    assert "a plot needs matplotlib, but the module matplotlib.axes is not installed" in line
     assert "pip install 'stereoweave[train]'" in line
     assert list(tmp_path.iterdir()) == []

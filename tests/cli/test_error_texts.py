@@ -20,15 +20,15 @@ ERRORS = {
     "other, found halves that do not resemble each other; give two files, left and right; or choose one of "
     f"{LAYOUTS} (--format)",
     f"depth {PAIR} --format crossed -o out": "--format: expected one picture that holds both views, found "
-    "two, left.png and right.png; leave it out, and give the left one first",
+    "two, left.png and right.png; omit this setting, and give the left picture first",
     "view both.png --format diagonal -o out.png": f"--format: expected one of {LAYOUTS}, mpo, jps, found "
     "'diagonal'",
     f"depth {PAIR} --calib turned.yml -o out": "turned.yml: expected a calibration of rectified pictures, "
     "found lenses with distortion; rectify the pair with it (--rectify)",
-    f"depth {PAIR} --focal-px 500 -o out": "metres: expected a baseline in addition to the focal length, "
-    "found none; give the baseline (--baseline-m)",
-    f"depth {PAIR} --baseline-m 0.1 -o out": "metres: expected a focal length in EXIF in addition to the "
-    "baseline, found none; give the focal length (--focal-px)",
+    f"depth {PAIR} --focal-px 500 -o out": "metres: expected a baseline besides the focal length, "
+    "found none in EXIF; give the baseline (--baseline-m)",
+    f"depth {PAIR} --baseline-m 0.1 -o out": "metres: expected a focal length besides the "
+    "baseline, found none in EXIF; give the focal length (--focal-px)",
     "view plain.png plain.png --rectify -o out.png": "--rectify: expected at least 40 feature matches "
     "that agree on the camera positions, found 0 of 0 matches; photograph a scene with more "
     "texture and with more overlap; or give a calibration (--calib)",
@@ -48,21 +48,21 @@ ERRORS = {
     f"depth {PAIR} --provider gpu -o out": "--provider: expected one of cpu, cuda, tensorrt, openvino, "
     "coreml, directml, found 'gpu'",
     f"depth {PAIR} --list list.txt -o out": "expected pictures or a folder, patterns of left and right "
-    "pictures, or a list of pairs, found pictures with a list; give exactly one of them (--left, --right, "
+    "pictures, or a list of pairs, found pictures and a list; give exactly one of them (--left, --right, "
     "--list)",
     "depth --left none*.png --right right*.png -o out": "--left: expected pictures that match none*.png, "
-    "found none; quote the pattern",
+    "found none; check and quote the pattern",
     "batch . out --gpus-each 1.5": "--gpus-each: expected 0, a fraction of 1 or a whole number, found 1.5",
     f"view {PAIR} --position 3 -o out.png": (
-        "--position: expected -1 to 2 (0 is the left camera, 1 the right), got 3"
+        "--position: expected -1 to 2 (0 is the left camera and 1 the right one), got 3"
     ),
     f"view {PAIR} --layout diagonal -o out.png": "--layout: expected one of "
     f"{', '.join([*VIEW_LAYOUTS, *ANIMATIONS])}, found 'diagonal'",
     "video plain.png -o out.mp4": "expected one kind of output, found none; choose one (--depth, "
     "--depth16, --position, --layout)",
-    "video plain.png --depth -o out.mp4": "plain.png: expected 3-D video, two views side by side or one "
-    "above the other, found too plain a picture to tell; give two files, left and right; or choose one of "
-    f"{LAYOUTS} (--format)",
+    "video plain.png --depth -o out.mp4": "plain.png: expected a 3-D video, two views side by side or one "
+    "above the other, found a picture that is too plain to tell; give two files, left and right; or choose "
+    f"one of {LAYOUTS} (--format)",
     "video plain.png --depth --format diagonal -o out.mp4": f"--format: expected one of {LAYOUTS}, "
     "found 'diagonal'",
     "synth make pylon --pairs 1 --size 8x8 -o set": "--size: expected 32 to 4096 px per side, found 8x8",
@@ -77,8 +77,8 @@ NOTES = {
     "(stereoweave rectify)",
     "check both.png": "side_by_side, detected from name and content; override it if it is wrong (--format)",
     "check right.png left.png": "left and right are swapped; give them the other way round",
-    f"depth {PAIR} --focal-px 600 --baseline-m 0.1 --rectify -o out": "no metres after rectification by "
-    "features; give a calibration (--calib)",
+    f"depth {PAIR} --focal-px 600 --baseline-m 0.1 --rectify -o out": "no depth in metres after "
+    "rectification from feature matches; give a calibration (--calib)",
     f"depth {PAIR} --write all -o out": f"no depth, point cloud or mesh: {NO_CAMERA}",
     "view upper.png lower.png --model small -o out.png": "the right picture is 2.0 px lower than the left "
     "one; rectify the pair (--rectify)",

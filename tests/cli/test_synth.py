@@ -127,10 +127,10 @@ def test_the_costs_of_the_effects_are_printed_in_milliseconds(monkeypatch, capsy
         ("synth make pylon --pairs 1 --view 0.5 --view 0.5 -o set", "--view: expected positions that differ"),
         ("synth make pylon --pairs 1 --rig 0 0.2 -o set", "focal_px and baseline_m must be above"),
         ("synth make pylon --pairs 1 --layout zip -o set", "--layout: expected one of shards, paper"),
-        ("synth make pylon --pairs 1 -o file/set", "file/set: expected a folder that can be written"),
+        ("synth make pylon --pairs 1 -o file/set", "file/set: expected a writable folder"),
         ("synth costs cathedral", "scene: expected one of "),
         ("synth check set", "set/set.json: expected the description of a set"),
-        ("synth sheet -o sheet.doc", "sheet.doc: expected a picture file ending"),
+        ("synth sheet -o sheet.doc", "sheet.doc: expected a picture file extension"),
     ],
 )
 def test_a_mistake_is_reported_in_one_line(tmp_path, monkeypatch, capsys, line, words):

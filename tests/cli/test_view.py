@@ -143,7 +143,7 @@ def test_a_wiggle_moves(pair, capfd, ending):
         ("--layout quilt --quilt 900x900 -o v.png", ["quilt", "2 to 200 views", "900x900"]),
         ("--convergence middle -o v.png", ["--convergence", "px, or auto", "'middle'"]),
         ("--convergence inf -o v.png", ["--convergence", "px, or auto", "'inf'"]),
-        ("--layout rgbd -o taken.png", ["taken_RGBD.png", "expected a file", "found a folder"]),
+        ("--layout rgbd -o taken.png", ["taken_RGBD.png", "expected a writable file", "found a folder"]),
     ],
 )
 def test_a_mistake_is_reported_in_one_line_before_anything_is_matched(

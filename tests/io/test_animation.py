@@ -124,7 +124,7 @@ def test_the_frames_of_a_gif_share_their_256_colours(tmp_path, moving):
 def test_a_single_frame_is_enough_and_no_frame_is_an_error(tmp_path, moving, ending):
     write_animation(tmp_path / f"a{ending}", moving[:1], 40)
     assert len(read_again(tmp_path / f"a{ending}")) == 1
-    with pytest.raises(StereoweaveError, match="frames: expected one or more"):
+    with pytest.raises(StereoweaveError, match="frames: expected at least one frame"):
         write_animation(tmp_path / f"b{ending}", [], 40)
     assert [file.name for file in tmp_path.iterdir()] == [f"a{ending}"]
 
@@ -132,7 +132,7 @@ def test_a_single_frame_is_enough_and_no_frame_is_an_error(tmp_path, moving, end
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_frames_of_two_sizes_are_refused_and_leave_no_file(tmp_path, moving, ending, without_shape_checks):
     with pytest.raises(
-        StereoweaveError, match="frames: expected all to have the same size, found 64x48 and 60x48"
+        StereoweaveError, match="frames: expected frames of the same size, found 64x48 and 60x48"
     ):
         write_animation(tmp_path / f"a{ending}", [*moving, moving[0][:, :60]], 40)
     assert list(tmp_path.iterdir()) == []
@@ -157,7 +157,7 @@ def test_a_full_disk_is_a_one_line_error_and_leaves_no_file(tmp_path, rng, endin
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
     try:
-        with pytest.raises(StereoweaveError, match=f"a{ending}: expected a file that can be written") as told:
+        with pytest.raises(StereoweaveError, match=f"a{ending}: expected a writable file") as told:
             write_animation(tmp_path / f"a{ending}", noise, 40)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
@@ -167,7 +167,7 @@ def test_a_full_disk_is_a_one_line_error_and_leaves_no_file(tmp_path, rng, endin
 
 @pytest.mark.parametrize("path", ["a.avi", "a.png", "a"])
 def test_an_unknown_ending_is_refused_with_a_list_of_the_known_ones(path):
-    with pytest.raises(StereoweaveError, match=rf"{path}: expected .* \.mp4, \.gif, \.webp, found"):
+    with pytest.raises(StereoweaveError, match=rf"{path}: expected .* \(\.mp4, \.gif, \.webp\), found"):
         check_animation_ending(path)
 
 

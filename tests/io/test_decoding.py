@@ -168,7 +168,7 @@ def test_postscript_with_the_ending_of_a_picture_is_refused(tmp_path):
     path = tmp_path / "left.png"
     path.write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 90 90\n%%EndComments\nshowpage\n")
     for read in (read_image, read_disparity_png, lambda at: read_pixels(at, "RGB")):
-        assert refusal(read, path).endswith("found something else")
+        assert refusal(read, path).endswith("found another type of file")
 
 
 def test_read_image_refuses_an_animation(tmp_path, picture):
@@ -204,8 +204,8 @@ def test_grey_is_the_same_in_every_pixel_format(tmp_path, mode, colour, expected
     [
         ((10_000, 7_000), "at most 65 megapixels, found 10000x7000"),
         ((40_000, 20_000), "at most 65 megapixels, found more"),
-        ((64, 32_767), "at most 32766 pixels a side, found 64x32767"),
-        ((32_767, 64), "at most 32766 pixels a side, found 32767x64"),
+        ((64, 32_767), "at most 32766 pixels per side, found 64x32767"),
+        ((32_767, 64), "at most 32766 pixels per side, found 32767x64"),
     ],
 )
 def test_too_large_a_picture_is_refused_before_it_is_decoded(tmp_path, size_px, found):
@@ -231,7 +231,7 @@ def test_one_picture_may_hold_two_views_of_the_greatest_length(tmp_path):
     path = tmp_path / "both.png"
     Image.new("L", (2 * 32_766, 32)).save(path)
     assert open_pictures([path], "side_by_side").pair.left.shape == (32, 32_766, 3)
-    assert "at most 32766 pixels a side, found 65532x32" in refusal(
+    assert "at most 32766 pixels per side, found 65532x32" in refusal(
         lambda: open_pictures([path], "side_by_side_half")
     )
 
@@ -341,7 +341,7 @@ def test_an_mpo_file_cut_within_the_head_of_its_second_picture_is_refused(tmp_pa
     path = tmp_path / "cut.mpo"
     for length in range(start, start + 150):
         path.write_bytes(whole[:length])
-        assert "found picture 2 truncated or damaged" in refusal(open_pictures, [path])
+        assert "found that picture 2 is truncated or damaged" in refusal(open_pictures, [path])
 
 
 @pytest.mark.parametrize("mark", [b"!", b","])
@@ -366,7 +366,7 @@ def test_a_gif_that_is_cut_where_another_picture_begins_is_refused(tmp_path, pic
         (b"Pf\n2 2\nnan\n", "a finite scale other than 0"),
         (b"Pf\n2 2\ninf\n", "a finite scale other than 0"),
         (b"Pf\n2 2\n0\n", "a finite scale other than 0"),
-        (b"Pf\n1 32767\n-1.0\n", "at most 32766 pixels a side"),
+        (b"Pf\n1 32767\n-1.0\n", "at most 32766 pixels per side"),
     ],
 )
 def test_a_pfm_file_with_an_invalid_header_is_refused(tmp_path, header, found):

@@ -57,9 +57,7 @@ def test_an_output_folder_that_is_a_file_is_named(tmp_path, picture, folder):
         target = tmp_path / folder / "out.png" if arguments else tmp_path / folder
         with pytest.raises(StereoweaveError) as caught:
             function(target, *arguments)
-        assert str(caught.value).startswith(
-            f"{tmp_path / folder}: expected a folder that can be written, found"
-        )
+        assert str(caught.value).startswith(f"{tmp_path / folder}: expected a writable folder, found")
         assert "\n" not in str(caught.value)
     assert (tmp_path / "occupied").read_text() == "a file"
 

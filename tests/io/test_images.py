@@ -80,7 +80,7 @@ def test_dark_grey_of_16_bits_stays_dark(tmp_path):
 def test_grey_beyond_16_bits_is_refused(tmp_path, level):
     Image.fromarray(np.full((40, 48), level, np.int32)).save(tmp_path / "grey.tiff")
     message = refusal_of(images.read_image, tmp_path / "grey.tiff")
-    assert "more than 16 bits a channel or values below 0" in message
+    assert "more than 16 bits per channel or with negative values" in message
 
 
 @pytest.mark.parametrize("channels", [3, 4])
@@ -144,7 +144,7 @@ def test_a_folder_is_refused_as_a_picture(tmp_path):
 @pytest.mark.parametrize("content", [b"", b"hello", b"cam0=[994.978 0 311.193]\n", b"\x89PNG\r\n\x1a\n"])
 def test_a_file_that_is_not_a_picture_is_named(tmp_path, content):
     (tmp_path / "picture.png").write_bytes(content)
-    assert refusal_of(images.read_image, tmp_path / "picture.png").endswith("found something else")
+    assert refusal_of(images.read_image, tmp_path / "picture.png").endswith("found another type of file")
 
 
 def test_a_picture_of_floats_is_refused(tmp_path):
@@ -191,4 +191,4 @@ def test_pictures_of_two_sizes_are_both_named_with_their_sizes(tmp_path, picture
     left, right = tmp_path / "left.png", tmp_path / "right.png"
     images.write_image(left, picture)
     images.write_image(right, picture[:, :-1])
-    assert f"{left} of 48x40 and {right} of 47x40" in refusal_of(images.read_pair, left, right)
+    assert f"{left} with 48x40 and {right} with 47x40" in refusal_of(images.read_pair, left, right)

@@ -112,7 +112,7 @@ def test_a_disparity_that_a_png_cannot_hold_leaves_no_file(tmp_path, wrong_px, f
 
 def test_a_disparity_png_of_8_bits_is_refused(tmp_path, picture):
     images.write_image(tmp_path / "disparity.png", picture[..., 0])
-    assert "found PNG of mode L" in refusal_of(maps.read_disparity_png, tmp_path / "disparity.png")
+    assert "found mode L (PNG)" in refusal_of(maps.read_disparity_png, tmp_path / "disparity.png")
 
 
 def test_a_depth_png_holds_millimetres_and_unknown_as_0(tmp_path):
@@ -143,7 +143,7 @@ def test_stored_values_are_read_unchanged(tmp_path, mode, values):
 
 def test_stored_values_of_another_mode_are_refused(tmp_path, picture):
     images.write_image(tmp_path / "colour.png", picture)
-    assert "mode L or 1, found PNG of mode RGB" in refusal_of(
+    assert "mode L or 1, found mode RGB (PNG)" in refusal_of(
         maps.read_pixels, tmp_path / "colour.png", "L", "1"
     )
     refusal_of(maps.read_pixels, tmp_path / "nowhere.png", "L")

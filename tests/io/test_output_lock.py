@@ -38,8 +38,8 @@ def assert_in_use(output: Path) -> None:
     with pytest.raises(OutputInUseError) as caught, lock_output(output):
         pass
     assert str(caught.value) == (
-        f"{output}: expected an output that no other command writes to, found one that is in use; "
-        "wait for the other command to end, or choose another output"
+        f"{output}: expected an output to which no other command is writing, found one that is in use; "
+        "wait for the other command to finish, or choose another output"
     )
 
 
@@ -96,12 +96,12 @@ def test_a_lock_ends_with_an_error_and_the_folder_of_a_new_file_is_made(tmp_path
 
 def test_a_lock_that_cannot_be_written_is_a_one_line_error(tmp_path):
     (tmp_path / ".lock").mkdir()
-    expected = r"\.lock: expected a file that can be written, found .*; remove it$"
+    expected = r"\.lock: expected a writable file, found .*; remove it$"
     with pytest.raises(StereoweaveError, match=expected), lock_output(tmp_path):
         pass
     (tmp_path / "file").touch()
     with (
-        pytest.raises(StereoweaveError, match=r"file: expected a folder that can be written, found a file"),
+        pytest.raises(StereoweaveError, match=r"file: expected a writable folder, found a file"),
         lock_output(tmp_path / "file" / "film.mp4"),
     ):
         pass

@@ -38,6 +38,7 @@ def test_an_invalid_description_is_refused_in_one_line(text, found):
 def test_a_folder_with_other_files_and_no_description_is_refused_with_the_first_name():
     check_unclaimed("out", "batch.json", iter(()))
     with pytest.raises(
-        StereoweaveError, match="^out: expected a new folder, or one with a batch.json, found a.png in it"
+        StereoweaveError,
+        match="^out: expected an empty folder or one with a batch.json, found one with a.png",
     ):
         check_unclaimed("out", "batch.json", iter(("b.png", "a.png")))

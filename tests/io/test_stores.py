@@ -125,7 +125,9 @@ def test_a_missing_source_is_a_one_line_error(store):
 
 def test_a_missing_file_is_named_in_full(store, tmp_path):
     store.check_destination()
-    assert error_of(lambda: store.read_bytes("a/b")).startswith(f"{store.at('a/b')}: expected a file")
+    assert error_of(lambda: store.read_bytes("a/b")).startswith(
+        f"{store.at('a/b')}: expected a readable file"
+    )
     assert not list(tmp_path.rglob("b"))
 
 
@@ -219,9 +221,7 @@ def test_unknown_keys_and_keys_without_permission_are_reported(bucket, s3, monke
         with another_environment(monkeypatch, **keys):
             assert "found no permission (Access Denied" in error_of(store.check_source)
             message = error_of(lambda: store.write_bytes("a", b""))
-            assert message.startswith(
-                f"{bucket}/a: expected a file that can be written, found no permission ("
-            )
+            assert message.startswith(f"{bucket}/a: expected a writable file, found no permission (")
             assert "found no permission (" in error_of(lambda: store.exists("a"))
 
 
@@ -275,7 +275,9 @@ def test_a_url_of_an_unknown_store_is_refused(place, found):
 def test_a_store_whose_library_is_missing_names_the_extra(place, library, monkeypatch):
     monkeypatch.setitem(sys.modules, library, None)
     message = error_of(lambda: store_at(place))
-    assert message.startswith(f"{place}: expected the library {library}, found no module")
+    assert message.startswith(
+        f"{place}: {place[:2]}:// needs the library {library}, but the module {library} "
+    )
     assert "install the extra 'cluster'" in message
 
 

@@ -136,8 +136,8 @@ def test_a_disparity_is_the_median_of_its_surface():
 @pytest.mark.parametrize(
     ("first_px", "second_px", "message"),
     [
-        ((20, 20), (60, 20), "pixel 60,20: .* from 0,0 to 59,39, found one outside"),
-        ((20, -1), (30, 20), "pixel 20,-1: .* outside"),
+        ((20, 20), (60, 20), "expected a pixel of the left picture, from 0,0 to 59,39, found 60,20"),
+        ((20, -1), (30, 20), "expected a pixel of the left picture, .*, found 20,-1"),
         ((20, 20), (20, 20), "two different pixels, found 20,20 twice"),
         ((5, 5), (20, 20), "pixel 5,5: .* only the left camera sees"),
         ((20, 20), (6, 6), "pixel 6,6: .* at least 50 %, found 49 %"),

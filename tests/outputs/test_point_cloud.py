@@ -221,7 +221,7 @@ def test_a_pair_without_known_depth_is_an_error():
     with pytest.raises(EmptyError, match="known depth, found none"):
         make_point_cloud(pair_of((40, 60)), nothing)
     speckled = (np.indices((40, 60)).sum(axis=0) % 2).astype(np.float32)
-    with pytest.raises(EmptyError, match="on one surface, found none"):
+    with pytest.raises(EmptyError, match="on the same surface, found none"):
         make_mesh(pair_of((40, 60)), estimate_of(two_planes(), confidence=speckled))
 
 

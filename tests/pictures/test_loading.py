@@ -91,7 +91,7 @@ def test_two_files_are_the_left_and_the_right_view(tmp_path, pair):
 def test_two_files_of_different_sizes_are_refused_with_both_sizes(tmp_path, pair):
     left, right = write_two(tmp_path, pair.left, pair.right[:, 2:])
     message = refusal(left, right)
-    assert f"{left} of 240x160 and {right} of 238x160" in message
+    assert f"{left} with 240x160 and {right} with 238x160" in message
 
 
 def test_two_files_of_under_32_pixels_are_refused(tmp_path, pair):
@@ -117,7 +117,7 @@ def test_values_that_no_photograph_has_are_refused_with_the_name(tmp_path, pair,
     Image.fromarray(pair.left[..., 0].astype(np.float32)).save(left)
     message = refusal(left) if alone else refusal(left, right)
     assert message.startswith(f"{left}: expected a picture")
-    assert "more than 16 bits a channel" in message
+    assert "more than 16 bits per channel" in message
 
 
 @pytest.mark.parametrize("count", [0, 3])
@@ -265,7 +265,7 @@ def test_an_mpo_file_whose_second_picture_is_a_preview_is_one_picture(tmp_path, 
     opened = open_pictures([path])
     assert opened.layout == "side_by_side"
     assert_eyes(opened, pair, tolerance=3)
-    assert "found one" in refusal(path, format="mpo")
+    assert "found only one" in refusal(path, format="mpo")
 
 
 def test_the_first_picture_of_an_mpo_file_may_be_asked_for(tmp_path, pair):
@@ -286,7 +286,7 @@ def test_a_truncated_mpo_file_is_refused_in_one_line(tmp_path, pair):
         cut.write_bytes(whole[: int(share * len(whole))])
         assert refusal(cut).startswith(f"{cut}: expected")
     cut.write_bytes(whole[: whole.index(b"\xff\xd8", 2)])
-    assert "found picture 2 truncated or damaged" in refusal(cut)
+    assert "found that picture 2 is truncated or damaged" in refusal(cut)
 
 
 def test_two_mpo_files_are_two_pictures(tmp_path, pair):
@@ -572,13 +572,13 @@ def box(*brands):
         ("a.jpg", box(b"mif1", b"heic"), "HEIC, the format of spatial photographs"),
         # In the file's head, after the version of the first brand, are 12 others.
         ("a.jpg", box(b"isom", *[b"iso2"] * 11, b"heic"), "HEIC, the format of spatial photographs"),
-        ("a.mov", box(b"qt  "), "a video; 'stereoweave video'"),
-        ("a.mkv", b"\x1a\x45\xdf\xa3", "a video; 'stereoweave video'"),
-        ("a.CR2", b"II\x2a\0", "a camera's raw file"),
-        ("a.dng", b"II\x2a\0", "a camera's raw file"),
-        ("a.jpg", b"PK\x03\x04" + bytes(1000), "something else"),
-        ("a.jpg", b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 90 90\n", "something else"),
-        ("a.jpg", b"", "something else"),
+        ("a.mov", box(b"qt  "), "a video; use 'stereoweave video'"),
+        ("a.mkv", b"\x1a\x45\xdf\xa3", "a video; use 'stereoweave video'"),
+        ("a.CR2", b"II\x2a\0", "a camera raw file"),
+        ("a.dng", b"II\x2a\0", "a camera raw file"),
+        ("a.jpg", b"PK\x03\x04" + bytes(1000), "another type of file"),
+        ("a.jpg", b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 90 90\n", "another type of file"),
+        ("a.jpg", b"", "another type of file"),
     ],
 )
 def test_what_is_not_read_is_refused_by_its_name(tmp_path, name, content, found):

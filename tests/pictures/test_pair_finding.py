@@ -260,7 +260,7 @@ def test_a_bad_line_is_told_by_its_number(tmp_path):
     with pytest.raises(StereoweaveError, match=r"list.txt, line 1: expected .*field larger than"):
         read_pair_list(path)
     path.write_text("# nothing\n")
-    with pytest.raises(StereoweaveError, match="expected one pair per line, found none"):
+    with pytest.raises(StereoweaveError, match="expected a list with one pair per line, found no pairs"):
         read_pair_list(path)
     with pytest.raises(StereoweaveError, match="expected a list of pairs, found no such file"):
         read_pair_list(tmp_path / "none.txt")
@@ -277,7 +277,7 @@ def test_the_words_of_the_command_line_name_one_source(tmp_path):
     assert find_pairs([Path(left), Path(right)], None, None, None) is None
     for words, found in {
         ((), None, None, None): "none",
-        ((folder,), left, right, None): "pictures with patterns",
+        ((folder,), left, right, None): "pictures and patterns",
         ((), left, None, None): "only one of the two patterns",
     }.items():
         with pytest.raises(

@@ -252,9 +252,9 @@ def test_a_layout_is_chosen_by_name_or_by_the_file_s_ending(path, name, expected
         ("view.png", "quild", "side_by_side, .*, quilt, .*, wiggle, found 'quild'"),
         ("view.mpo", "crossed", r"view\.mpo: expected the layout side_by_side .* found crossed"),
         ("view.jps", "quilt", r"view\.jps: expected the layout crossed .* found quilt"),
-        ("view.png", "wiggle", r"view\.png: expected one of the animation file endings \.mp4, \.gif, \.webp"),
-        ("view.gif", "quilt", r"view\.gif: expected a picture file ending \(\.png"),
-        ("view.mp4", None, r"view\.mp4: expected a picture file ending \(\.png"),
+        ("view.png", "wiggle", r"view\.png: expected an animation file extension \(\.mp4, \.gif, \.webp"),
+        ("view.gif", "quilt", r"view\.gif: expected a picture file extension \(\.png"),
+        ("view.mp4", None, r"view\.mp4: expected a picture file extension \(\.png"),
     ],
 )
 def test_an_unknown_layout_or_one_that_does_not_fit_the_ending_is_refused(path, name, expected):
@@ -275,8 +275,8 @@ def test_positions_that_can_be_rendered_are_accepted(positions, strength):
     [
         ((7.0,), 1.0, "got 7"),
         ((float("nan"),), 1.0, "got nan"),
-        ((0.0, 1.0), 4.0, "got -1.5, position 0 at strength 4"),
-        ((0.5, 1.5), 2.0, "got 2.5, position 1.5 at strength 2"),
+        ((0.0, 1.0), 4.0, r"got -1.5 \(position 0 at strength 4\)"),
+        ((0.5, 1.5), 2.0, r"got 2.5 \(position 1.5 at strength 2\)"),
         ((0.5,), float("nan"), "got nan"),
     ],
 )

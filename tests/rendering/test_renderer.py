@@ -358,7 +358,9 @@ def test_between_images_of_different_exposure_the_look_changes_gradually(rng):
 @pytest.mark.parametrize("convergence_px", [float("nan"), float("inf"), -41.0])
 def test_a_convergence_beyond_the_pictures_width_is_refused(rng, convergence_px):
     left, right, estimate = random_scene(rng)
-    with pytest.raises(ValueError, match=r"^convergence_px: expected -40 to 40 px, .*, got "):
+    with pytest.raises(
+        ValueError, match=r"^convergence_px: expected -40 to 40 px \(the picture's width\), got "
+    ):
         Renderer(StereoPair(left=left, right=right), estimate, convergence_px=convergence_px)
 
 

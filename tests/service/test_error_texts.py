@@ -27,11 +27,11 @@ ERRORS: dict[str, tuple[str, dict[str, str], dict[str, Any]]] = {
         {"picture": "left.png"},
         {},
     ),
-    "format: expected one picture that holds both views, found two, left and right; leave it out, and give "
-    "the left one first": ("/disparity", PAIR, {"format": "crossed"}),
+    "format: expected one picture that holds both views, found two, left and right; omit this setting, "
+    "and give the left picture first": ("/disparity", PAIR, {"format": "crossed"}),
     "calib: expected a calibration of rectified pictures, found lenses with distortion; rectify the pair "
     "with it (rectify)": ("/disparity", {**PAIR, "calib": "turned.yml"}, {}),
-    "metres: expected a baseline in addition to the focal length, found none; give the baseline "
+    "metres: expected a baseline besides the focal length, found none in EXIF; give the baseline "
     "(baseline_m)": (
         "/depth",
         PAIR,
@@ -47,7 +47,7 @@ ERRORS: dict[str, tuple[str, dict[str, str], dict[str, Any]]] = {
     "rectified pair (calib, focal_px, baseline_m)": ("/depth", PAIR, {}),
     "range: expected disparities between -640 and 640 px, the width of the pictures, got 700 and 800; omit "
     "it for automatic detection": ("/disparity", PAIR, {"range": "700,800"}),
-    "position: expected -1.0 to 2.0 (0 is the left camera, 1 the right), got 3.5": (
+    "position: expected -1.0 to 2.0 (0 is the left camera and 1 the right one), got 3.5": (
         "/view",
         PAIR,
         {"position": 2, "strength": 2},
@@ -62,7 +62,7 @@ NOTES: dict[str, tuple[dict[str, str], dict[str, Any]]] = {
         {"picture": "both.png"},
         {},
     ),
-    "no metres after rectification by features; give a calibration (calib)": (
+    "no depth in metres after rectification from feature matches; give a calibration (calib)": (
         PAIR,
         {"focal_px": 600, "baseline_m": 0.1, "rectify": True},
     ),

@@ -212,8 +212,9 @@ def test_an_output_in_use_is_refused_until_its_process_is_killed(tmp_path, capsy
         assert run(video, tmp_path / "link" / "out.mp4", "--depth") == 2
         first.kill()
     assert capsys.readouterr().err == (
-        f"stereoweave: {tmp_path / 'link' / 'out.mp4'}: expected an output that no other command writes to, "
-        "found one that is in use; wait for the other command to end, or choose another output\n"
+        f"stereoweave: {tmp_path / 'link' / 'out.mp4'}: expected an output to which no other "
+        "command is writing, found one that is in use; wait for the other command to finish, or choose "
+        "another output\n"
     )
     assert first.wait() == -signal.SIGKILL
     assert run(video, out, "--depth") == 0
@@ -249,7 +250,7 @@ def test_a_full_disk_is_reported_in_one_line_that_says_how_to_resume(tmp_path):
     assert done.returncode == 2
     folder = tmp_path / "out.mkv.parts"
     assert done.stderr.splitlines()[-1] == (
-        f"stereoweave: {tmp_path / 'out.mkv'}: expected a file that can be written, found file too large; "
+        f"stereoweave: {tmp_path / 'out.mkv'}: expected a writable file, found file too large; "
         f"finished parts are in {folder}; rerun the same command to resume"
     )
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in.mp4", "out.mkv.parts", "whole.mkv"]
@@ -329,7 +330,7 @@ def test_a_file_that_is_not_a_3d_video_is_refused_in_one_line(tmp_path, capsys):
     flat = write_video(tmp_path / "flat.mp4", wide, codec="libx264")
     broken = tmp_path / "broken.mp4"
     broken.write_bytes(flat.read_bytes()[:400])
-    for video, told in ((flat, "expected 3-D video"), (broken, "expected a video")):
+    for video, told in ((flat, "expected a 3-D video"), (broken, "expected a video")):
         assert run(video, tmp_path / "out.mp4", "--depth") == 2
         [line] = capsys.readouterr().err.splitlines()
         assert told in line

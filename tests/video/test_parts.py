@@ -96,7 +96,7 @@ def test_the_remedy_for_parts_without_settings_is_to_remove_their_folder(tmp_pat
 
 def test_a_disk_that_is_full_from_the_start_is_reported_in_one_line_with_the_file(tmp_path):
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    told = r"settings\.json: expected a file that can be written, found file too large$"
+    told = r"settings\.json: expected a writable file, found file too large$"
     with pytest.raises(StereoweaveError, match=told):
         resource.setrlimit(resource.RLIMIT_FSIZE, (1, hard))
         try:

@@ -133,7 +133,7 @@ def test_an_unsupported_declared_frame_packing_is_named(tmp_path):
 def test_a_video_that_is_not_3d_is_refused_with_a_remedy(tmp_path):
     path = write_video(tmp_path / "video.mkv", [left for left, _ in example_pairs(5)])
     message = refusal(path)
-    assert message.startswith(f"{path}: expected 3-D video")
+    assert message.startswith(f"{path}: expected a 3-D video")
     assert "(format)" in message
     assert "two files" in message
     assert open_video([path], "side_by_side_half").size_px == (160, 96)

@@ -41,7 +41,7 @@ def test_variants_are_made_from_a_shipped_network(tmp_path, monkeypatch, capsys)
         ),
         ("export none.onnx -o a.onnx", "none.onnx: expected an ONNX matcher file, found no such file"),
         ("export none -o a.onnx", "none"),
-        ("export small -o a.onnx --half folder.onnx", "folder.onnx: expected a file that can be written"),
+        ("export small -o a.onnx --half folder.onnx", "folder.onnx: expected a writable file"),
     ],
 )
 def test_an_impossible_export_is_reported_in_one_line(tmp_path, monkeypatch, capsys, arguments, told):

@@ -104,7 +104,7 @@ def test_an_error_of_rank_0_alone_ends_all_with_its_one_line(folder):
     assert process.wait() == 1
     told = log.read_text()
     assert told.count("stereoweave: ") == 1
-    assert f"stereoweave: {folder / 'taken'}: expected a folder that can be written" in told
+    assert f"stereoweave: {folder / 'taken'}: expected a writable folder" in told
     assert "RuntimeError" not in told
 
 

@@ -301,7 +301,7 @@ def test_a_recipe_with_sizes_that_the_network_cannot_divide_is_refused(tmp_path,
 
 def test_a_run_into_a_file_fails_before_any_pair_is_made(recipe_file, tmp_path):
     (tmp_path / "file").write_text("kept")
-    with pytest.raises(StereoweaveError, match="file: expected a folder that can be written"):
+    with pytest.raises(StereoweaveError, match="file: expected a writable folder"):
         train(recipe_file, tmp_path / "file", QUIET)
     assert [file.read_text() for file in tmp_path.iterdir()] == ["kept"]
 

@@ -192,7 +192,9 @@ def test_the_greatest_depth_is_accepted_and_one_beyond_is_refused():
     torch.testing.assert_close(build_curve(recipe).encode(at_the_end)[0, 0, 0, :2], torch.tensor([0.0, 0.25]))
     beyond = batch_of([[0.89, 1.8, torch.nan]], [5.4], [0.0])
     message = complaint(losses_of, recipe, Constant("code", 0.5), beyond)
-    assert message.startswith("depth: expected more than 0 and at most 6.0 m, NaN where unknown, found 6.06")
+    assert message.startswith(
+        "depth: expected more than 0 and at most 6.0 m, or NaN where unknown, found 6.06"
+    )
 
 
 def test_a_disparity_beyond_the_greatest_counts_as_unknown():
@@ -203,7 +205,7 @@ def test_a_disparity_beyond_the_greatest_counts_as_unknown():
 
 def test_a_disparity_below_0_is_refused():
     message = complaint(losses_of, DISPARITY, Constant("code", 0.5), batch_of([[2.0, -0.5, 0.0]]))
-    assert message.startswith("disparity: expected 0 to 4.0 px, NaN where unknown, found -0.5")
+    assert message.startswith("disparity: expected 0 to 4.0 px, or NaN where unknown, found -0.5")
 
 
 def test_depth_without_a_camera_is_refused():

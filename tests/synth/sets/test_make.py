@@ -128,9 +128,8 @@ def test_no_other_process_resumes_until_a_killed_one_and_its_workers_have_ended(
     first = start(tmp_path, out, pair_maker="PaintedPairMaker(halts_at=6)")
     try:
         os.waitpid(first.pid, os.WUNTRACED)
-        assert "expected an output that no other command writes to, found one that is in use" in error_of(
-            made, out
-        )
+        text = "expected an output to which no other command is writing, found one that is in use"
+        assert text in error_of(made, out)
     finally:
         first.kill()
         first.communicate()  # returns once its workers have ended too
@@ -145,7 +144,7 @@ def test_a_full_disk_is_a_one_line_error_and_leaves_no_partial_file(tmp_path):
     # There is room for set.json but not for a shard, which raises the same OSError as a full disk does.
     full = start(tmp_path, out, first="resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))")
     message = full.communicate()[1].splitlines()[-1]
-    assert "pylon-000000-000003.tar: expected a file that can be written, found file too large" in message
+    assert "pylon-000000-000003.tar: expected a writable file, found file too large" in message
     assert message.endswith("all finished pairs are complete; rerun the same command to resume")
     assert sorted(contents(out)) == ["set.json"]
 
@@ -322,7 +321,7 @@ def test_a_damaged_description_is_a_one_line_error(finished, tmp_path, name, val
 def test_a_folder_with_other_files_is_refused_and_left_unchanged(tmp_path):
     (tmp_path / "thesis.tex").write_text("mine")
     (tmp_path / ".set-0123abcd.json").touch()
-    assert "found thesis.tex" in error_of(made, tmp_path)
+    assert "found one with thesis.tex" in error_of(made, tmp_path)
     assert sorted(contents(tmp_path)) == [".set-0123abcd.json", "thesis.tex"]
 
 
