@@ -76,7 +76,7 @@ ERRORS = {
         lambda: sw.synthesize(BLACK, BLACK, 3, threads=1)
     ),
     "expected one kind of output, found none; choose one (depth, depth16, position, layout)": VideoJob,
-    "gpus_each: expected 0, a fraction of 1 or a whole number, found 1.5": lambda: Engine(gpus_each=1.5),
+    "gpus_each: expected 0, a fraction below 1, or a whole number, found 1.5": lambda: Engine(gpus_each=1.5),
 }
 
 

@@ -1,4 +1,4 @@
-"""Access control of the page: only the routes it needs, and only each visitor's own files."""
+"""Access control for the page: visitors can reach only the necessary routes and their own files."""
 
 import json
 import re
@@ -14,19 +14,19 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 # A browser may load nothing from other servers, whatever the page requests.
 _POLICY = "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:"
-_REFUSED = "expected a file that you uploaded or that this page made for you; upload the pictures again"
+_REFUSED = "access is limited to your uploads and the files made from them; upload the pictures again"
 _COOKIE = "stereoweave-visitor"
 _VISITOR = re.compile(r"[\w-]{43}", re.ASCII)
 _API = "/gradio_api"
 _FILE = f"{_API}/file="
-# Gradio's other routes stay closed: unqueued calls, a proxy, recordings, streams, component functions.
+# Gradio's other routes stay closed: unqueued calls, a proxy, recordings, streams and component functions.
 _ROUTES = re.compile(
     r"/|/(config|theme\.css|favicon\.ico|manifest\.json|robots\.txt)|/(static|assets|svelte)(/[\w-][\w.-]*)+"
     rf"|{_API}/(info|app_id|startup-events|upload|upload_progress|queue/join|queue/data|reset|cancel)/?"
     rf"|{_API}/heartbeat/\w+|{_FILE}.+",
     re.DOTALL,
 )
-# Routes whose responses name files to the visitor.
+# Routes whose responses contain paths of files for the visitor.
 _NAMING = (f"{_API}/upload", f"{_API}/queue/data")
 _MOST_BODY_BYTES = 1_000_000
 # A path takes about 200 bytes; a visitor who studies a pair for an hour receives hundreds of paths.
@@ -35,7 +35,7 @@ _MOST_VISITORS = 1_000
 
 
 class ContentPolicy:
-    """Middleware that keeps browsers from loading anything from other servers."""
+    """Middleware whose content security policy lets browsers load files only from this server."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
@@ -45,11 +45,11 @@ class ContentPolicy:
 
 
 class OwnFiles:
-    """Middleware that restricts visitors to the files that the page has named to them.
+    """Middleware that gives each visitor access only to files whose paths the page has sent to that visitor.
 
-    These are uploads, results and the sample. A requested path is compared as text with the paths in earlier
-    responses to the same cookie, so a foreign path is never looked up on disk. Gradio checks paths only in
-    servers that it starts itself, and not per visitor.
+    These are the visitor's uploads, the results and the sample. A requested path is compared as text with the
+    paths in earlier responses to the same cookie, so other paths are never looked up on disk. Gradio checks
+    paths only in servers that it starts itself, and does not distinguish visitors.
     """
 
     def __init__(self, app: ASGIApp) -> None:
@@ -74,11 +74,11 @@ class OwnFiles:
         await self._app(_remove_cookies(scope), receive, send)
 
     async def _checked(self, scope: Scope, receive: Receive, visitor: str) -> Receive:
-        """Return the channel from which to read a request.
+        """Check a request, and return the channel from which to read it.
 
         Raises:
-            PermissionError: If the route is closed, the request is invalid, or it names another visitor's
-                file.
+            PermissionError: If the route is closed, the request is invalid, or one of its files belongs to
+                another visitor.
         """
         path, method = scope["path"], scope.get("method")
         if scope["type"] != "http" or not _ROUTES.fullmatch(path):
@@ -96,9 +96,9 @@ class OwnFiles:
             raise PermissionError
 
     def _watch_response(self, send: Send, visitor: str) -> Send:
-        """Return a `send` that remembers the files that a response names.
+        """Return a `send` that also remembers the paths of the files in a response.
 
-        The response is a list of uploads, or has one event per line.
+        The response is either a list of uploads or a stream with one event per line.
         """
         kept = b""
 
@@ -125,7 +125,7 @@ class OwnFiles:
 
 
 class _Named:
-    """Paths named to each visitor, limited per visitor, so that no visitor displaces another's paths."""
+    """Paths sent to each visitor, with a limit per visitor so that no visitor displaces another's paths."""
 
     def __init__(self) -> None:
         self._visitors: OrderedDict[str, OrderedDict[str, None]] = OrderedDict()
@@ -144,15 +144,15 @@ class _Named:
 
 
 def _use(entries: OrderedDict[str, Any], key: str, most: int) -> None:
-    """Move an entry to the end, and remove the first entry if there are more than `most`."""
+    """Move an entry to the end; if there are more than `most` entries, remove the first one."""
     entries.move_to_end(key)
     if len(entries) > most:
         entries.popitem(last=False)
 
 
 def _find_visitor(scope: Scope) -> str:
-    """Return the visitor's cookie; an empty string if there is none."""
-    # Parsed by hand: in some versions of Python, the time to unquote a cookie is quadratic in its length.
+    """Return the visitor's cookie, or an empty string if there is none."""
+    # Parsed by hand, because some versions of Python take quadratic time to unquote a cookie.
     for header in Headers(scope=scope).getlist("cookie"):
         for cookie in header.split(";"):
             name, _, value = (part.strip() for part in cookie.partition("="))
@@ -162,7 +162,7 @@ def _find_visitor(scope: Scope) -> str:
 
 
 def _remove_cookies(scope: Scope) -> Scope:
-    """Return the request without cookies, because Gradio would unquote even the cookies of other servers."""
+    """Return the request without cookies, because Gradio would unquote even cookies set by other servers."""
     return {**scope, "headers": [(name, value) for name, value in scope["headers"] if name != b"cookie"]}
 
 
@@ -176,12 +176,12 @@ def _add_header(send: Send, name: str, value: str) -> Send:
 
 
 async def _read_json(request: Request) -> tuple[Any, bytes]:
-    """Return the value of a request's JSON body, and the value encoded again as a body for Gradio.
+    """Return the value of a request's JSON body, and a new body that encodes this value.
 
-    So Gradio reads exactly what was checked.
+    Gradio reads the new body, and thus exactly the value that was checked.
 
     Raises:
-        PermissionError: If the body is not JSON, or too large.
+        PermissionError: If the body is not JSON, or is too large.
     """
     body = b""
     try:
@@ -196,7 +196,10 @@ async def _read_json(request: Request) -> tuple[Any, bytes]:
 
 
 def _find_paths(value: Any) -> Iterator[Any]:
-    """Yield every value of a key `path` within a value: Gradio treats any mapping with this key as a file."""
+    """Yield the value of every key `path` in a nested value.
+
+    Gradio treats any mapping with this key as a file.
+    """
     waiting = [value]
     while waiting:
         match waiting.pop():
@@ -209,7 +212,7 @@ def _find_paths(value: Any) -> Iterator[Any]:
 
 
 def _replay(body: bytes, receive: Receive) -> Receive:
-    """Return a channel that delivers a body that was already read, and then the messages after it."""
+    """Return a channel that delivers a body that was already read, then any further messages."""
     messages = [{"type": "http.request", "body": body, "more_body": False}]
 
     async def receive_again() -> Message:

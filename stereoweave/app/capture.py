@@ -1,4 +1,4 @@
-"""Sources of live video: cameras, files and streams, read synchronously by a thread."""
+"""Capture of live video from cameras, files and streams by a background thread."""
 
 import threading
 import time
@@ -14,7 +14,7 @@ from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.pictures.pair_layouts import Picture
 
 _DEFAULT_RATE = 25.0
-# A network stream may be slow; a camera without a frame for this long is disconnected.
+# A network stream may be slow; a camera that delivers no frame for this long is disconnected.
 _TIMEOUT_S = 10.0
 
 
@@ -22,9 +22,9 @@ class Moment(NamedTuple):
     """RGB images captured from all sources at the same time.
 
     Attributes:
-        number: Number of the moment, from 0.
+        number: Number of the moment, counted from 0.
         pictures: One image per source.
-        taken_s: Time of the capture, from `time.monotonic`.
+        taken_s: Time of capture, as returned by `time.monotonic`.
     """
 
     number: int
@@ -33,13 +33,13 @@ class Moment(NamedTuple):
 
 
 class Capture:
-    """One or two sources, read synchronously by a thread that keeps only the newest moment.
+    """One or two sources, read simultaneously by a thread that keeps only the newest moment.
 
     A video file is read at its own frame rate, as if it were a camera.
 
     Args:
-        sources: One source with both views, or a left and a right source. Each is the number of a camera, a
-            video file, the address of a stream, or a series of pictures such as frame%03d.png.
+        sources: One source with both views, or a left and a right source. Each is a camera number, a video
+            file, a stream address, or a series of pictures such as frame%03d.png.
 
     Raises:
         FormatError: If a source cannot be opened.
@@ -75,7 +75,7 @@ class Capture:
         self._thread.join(timeout=1)  # if a camera hangs, its thread ends with the process
 
     def newest(self, after: int) -> Moment | None:
-        """Wait for a moment with a number above `after` and return the newest; None at the end of a video.
+        """Return the newest moment as soon as its number exceeds `after`; None at the end of a video.
 
         Raises:
             StereoweaveError: If a camera or stream stops, or if a video has no frames.
@@ -113,7 +113,7 @@ class Capture:
                 self._changed.notify_all()
 
     def _read(self) -> tuple[Picture, ...] | None:
-        # Grab all images before decoding any, so that two cameras are as close in time as possible.
+        # Grab all images before decoding any, so that they are as close in time as possible.
         if not all([capture.grab() for capture in self._captures]):
             return None
         frames = [capture.retrieve() for capture in self._captures]
@@ -124,7 +124,7 @@ class Capture:
 
 def _open_source(source: str) -> cv2.VideoCapture:
     level = cv2.utils.logging.getLogLevel()
-    # The error below reports a failure, which OpenCV would print as well.
+    # A failure is reported by the error below; OpenCV would also print a line about it.
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     capture = cv2.VideoCapture(int(source) if source.isdigit() else source)
     cv2.utils.logging.setLogLevel(level)
@@ -137,6 +137,6 @@ def _open_source(source: str) -> cv2.VideoCapture:
     else:
         found = "a file that OpenCV cannot open" if Path(source).exists() else "no such file"
     raise FormatError(
-        f"{source}: expected the number of a camera, a video file, the address of a stream, or pictures such "
-        f"as frame%03d.png, found {found}"
+        f"{source}: expected a camera number, a video file, a stream address, or pictures such as "
+        f"frame%03d.png, found {found}"
     )

@@ -1,4 +1,4 @@
-"""Live view of cameras on a local web page: the left image with its disparity in colour beside it."""
+"""Live view of cameras on a local web page: the left image next to its disparity in colour."""
 
 import time
 from collections import deque
@@ -19,7 +19,7 @@ from stereoweave.matching.matcher import Matcher
 from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS, Frame, Picture, detect_layout
 from stereoweave.stereo import StereoCamera, StereoPair
 
-# Share of the way that the colour range moves towards the range of a new frame; at 1, colours would flicker.
+# Fraction by which the colour range moves towards a new frame's range; at 1, colours would flicker.
 _RANGE_SHARE = 0.1
 _RANGE_STEP_PX = 4
 _RATE_FRAMES = 30
@@ -105,7 +105,7 @@ def follow_range(
 def compose(
     pair: StereoPair, disparity_px: Float[np.ndarray, "h w"], range_px: tuple[float, float], status: str
 ) -> Frame:
-    """Draw the left image with its disparity beside it and a line of text above both."""
+    """Draw the left image and its disparity side by side, with a line of text above."""
     colours = colour_disparity(disparity_px, range_px)
     if pair.left_seen is not None:
         colours[~pair.left_seen] = 0
@@ -130,7 +130,7 @@ def _split_pair(pictures: Sequence[Picture], format: str | None) -> StereoPair:
         left, right = pictures
     else:
         [both] = pictures
-        PAIR_LAYOUTS[format].eye_size_px(both.shape[1], both.shape[0])  # raises if the image cannot be halved
+        PAIR_LAYOUTS[format].eye_size_px(both.shape[1], both.shape[0])  # raises FormatError
         left, right = PAIR_LAYOUTS[format].eyes(both)
     return StereoPair(left=left, right=right)
 

@@ -1,4 +1,7 @@
-"""The Gradio web page: depth of an uploaded pair, a slider through views, point cloud, distances, files."""
+"""The Gradio web page, which shows the depth of an uploaded pair.
+
+The page also has a slider to move the viewpoint, a point cloud, distance measurement and downloads.
+"""
 
 import html
 import importlib.resources
@@ -34,8 +37,8 @@ from stereoweave.pictures.loading import FORMATS
 from stereoweave.pictures.prepare import Request
 
 _LIFETIME_S = 3600
-# Each session keeps its last result: in memory 60 MB and 19 bytes per pixel of the left picture (0.5 GB at 24
-# megapixels), and on disk its files (0.9 GB at 24 megapixels).
+# Each session keeps its last result. It takes 60 MB plus 19 bytes per pixel of the left picture in memory
+# (0.5 GB at 24 megapixels), and the size of its files on disk (0.9 GB at 24 megapixels).
 _MOST_SESSIONS = 4
 _DETECTED = "detected"
 _MODELS = [("fast", "small"), ("fine", "base")]
@@ -68,7 +71,7 @@ _GONE = "This result has expired (results are kept for an hour). Find depth agai
 
 
 def label_of(setting: str) -> str | None:
-    """Return the page's label for a setting; None if the page does not have it."""
+    """Return the page's label for a setting; None if the page does not have that setting."""
     return f"“{_LABELS[setting]}”" if setting in _LABELS else None
 
 
@@ -119,7 +122,7 @@ class Page:
         self._sample = gr.Button("Try the sample", elem_id="sample")
 
     def _build_results(self) -> None:
-        """Build the part that shows results."""
+        """Build the part of the page that shows results."""
         with gr.Tabs() as self._tabs:
             with gr.Tab("View and depth", id="first"):
                 self._view = _make_picture("New view", "view")
@@ -190,8 +193,8 @@ class Page:
             concurrency_limit=None,
             api_visibility="private",
         )
-        # Loaded when its tab is opened, under a new name each time: Gradio's viewer stays empty if its value
-        # arrives before the viewer is visible, or if the same value arrives twice.
+        # The point cloud is loaded when its tab is opened, under a new name each time. Gradio's viewer stays
+        # empty if its value arrives before the viewer is visible, or if the same value arrives twice.
         self._cloud_tab.select(
             self._make_cloud, self._session, self._cloud, concurrency_id="matching", api_visibility="private"
         )
@@ -206,7 +209,7 @@ class Page:
         )
 
     def _fill_in_sample(self) -> dict[Any, Any]:
-        """Fill in the form with the package's sample pair."""
+        """Fill the form with the package's sample pair."""
         folder = sample_folder()
         return {
             self._left: str(folder / "left.jpg"),
@@ -220,7 +223,7 @@ class Page:
         }
 
     def _find_depth(self, given: dict[Any, Any], progress: Any = gr.Progress()) -> dict[Any, Any]:  # noqa: B008
-        """Match the given pictures. Returns the page's new content: the result, or an error."""
+        """Match the given pictures, and return the page's new content: the result or an error."""
         _remove_files(given[self._session])
         try:
             uploads, folder = self._make_uploads(given), Path(tempfile.mkdtemp(dir=self._folder))
@@ -234,14 +237,14 @@ class Page:
             }
 
     def _format_line(self, line: str) -> str:
-        """Put a message on one line, without the names of this computer's folders."""
+        """Format a message as one line, without the paths of temporary folders."""
         return re.sub(rf"{re.escape(str(self._folder))}/\w+/", "", " ".join(line.splitlines()))
 
     def _format_error(self, error: Exception) -> str:
         return _format_notice([self._format_line(format_error(error, label_of))], problem=True)
 
     def _write_files(self, session: Session | None, progress: Any = gr.Progress()) -> dict[Any, Any]:  # noqa: B008
-        """Write the result's files; this takes as long as everything before it together."""
+        """Write the result's files. This takes as long as all previous steps together."""
         if session is None:
             return {self._files: None}
         _report_progress(progress, 0.8, "writing the files")
@@ -296,7 +299,7 @@ class Page:
         }
 
     def _render_view(self, session: Session | None, position: float) -> tuple[Any, str]:
-        """Render the view from a position. Returns the image and a line that describes it."""
+        """Render the view from a position, and return the image and a one-line description."""
         if session is None:
             return gr.skip(), _GONE
         view = session.renderer.view(position)
@@ -304,14 +307,14 @@ class Page:
         return view.image, f"{position:g}, {_describe_position(position)}; {unseen}"
 
     def _make_cloud(self, session: Session | None) -> str | None:
-        """Write the point cloud. Returns the path of its file; None if there is no point cloud."""
+        """Write the point cloud, and return the path of its file; None if there is no point cloud."""
         cloud = session and write_cloud(session.folder / f"{uuid4().hex}.glb", session.result)
         return str(cloud) if cloud else None
 
     def _measure_click(
         self, session: Session | None, clicks: list[tuple[int, int]], event: gr.SelectData
     ) -> tuple[Any, str, list[tuple[int, int]]]:
-        """Mark the clicked points, at most two, in the left image, and describe their depth and distance."""
+        """Mark up to two clicked points in the left image, and describe their depths and their distance."""
         if session is None:
             return gr.skip(), _format_paragraphs([_GONE]), []
         column, row = event.index
@@ -344,7 +347,7 @@ def _make_picture(label: str, name: str) -> gr.Image:
 
 
 def _format_notice(lines: Sequence[str], *, problem: bool = False) -> str:
-    """Format lines as HTML paragraphs; a problem is highlighted, and screen readers announce it at once."""
+    """Format lines as HTML paragraphs. A problem is highlighted, and announced at once by screen readers."""
     look, role = ("notice problem", "alert") if problem else ("notice", "status")
     return f'<div class="{look}" role="{role}">{_format_paragraphs(lines)}</div>'
 
@@ -371,7 +374,7 @@ def _format_legend(colours: str, *labels: str) -> str:
 
 
 def _describe_position(position: float) -> str:
-    """Describe in words the position from which a view is seen."""
+    """Describe the position of a view in words."""
     if position in (0, 1):
         return "the right picture itself" if position else "the left picture itself"
     if position < 0:
@@ -380,5 +383,5 @@ def _describe_position(position: float) -> str:
 
 
 def sample_folder() -> Path:
-    """Return the folder of the sample pair."""
+    """Return the folder that contains the sample pair."""
     return Path(str(importlib.resources.files("stereoweave"))) / "sample"

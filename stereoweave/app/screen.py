@@ -1,7 +1,7 @@
 """Local web page that shows the newest image as a stream of JPEG images.
 
 The headless build of OpenCV has no windows, and a rig often has no screen. Browsers show a stream of JPEG
-images (multipart/x-mixed-replace) without a script, and on another machine through a tunnel.
+images (multipart/x-mixed-replace) without a script, even on another machine through a tunnel.
 """
 
 import threading
@@ -17,9 +17,9 @@ from stereoweave.errors import StereoweaveError
 from stereoweave.pictures.pair_layouts import Picture
 
 _ADDRESS = "127.0.0.1"
-# Other names are refused: another site could point its own name at this address (DNS rebinding).
+# Other names are refused, because another site could point its own name at this address (DNS rebinding).
 _HOST_NAMES = (_ADDRESS, "localhost")
-# Not "picture": FFmpeg, a possible client, mistakes its first letters for the start of a QuickTime file.
+# Not "picture", because FFmpeg, a possible client, takes "pict" for the start of a QuickTime file.
 _BOUNDARY = "frame"
 _PAGE = b"""<!doctype html>
 <html lang="en">
@@ -29,7 +29,7 @@ _PAGE = b"""<!doctype html>
   body { margin: 0; background: #111 }
   img { display: block; width: 100vw; height: 100vh; object-fit: contain }
 </style>
-<img src="/stream" alt="The left image with its disparity in colour beside it">
+<img src="/stream" alt="The left image next to its disparity in colour">
 </html>
 """
 _JPEG_QUALITY = 85
@@ -42,7 +42,7 @@ class Screen(ThreadingHTTPServer):
         port: Port number; 0 for any free port.
 
     Raises:
-        StereoweaveError: If the port is in use.
+        StereoweaveError: If the port cannot be opened.
     """
 
     def __init__(self, port: int) -> None:
@@ -50,7 +50,7 @@ class Screen(ThreadingHTTPServer):
             super().__init__((_ADDRESS, port), _Handler)
         except OSError as error:
             raise StereoweaveError(
-                f"expected a free port, found {port} ({error.strerror}); use 0 for any free port",
+                f"port {port} cannot be opened ({error.strerror}); use 0 for any free port",
                 setting="port",
             ) from error
         self.url = f"http://{_ADDRESS}:{self.server_port}/"
@@ -74,7 +74,7 @@ class Screen(ThreadingHTTPServer):
             self._changed.notify_all()
 
     def show(self, picture: Picture) -> None:
-        """Replace the shown image with a new RGB image."""
+        """Replace the displayed image with a new RGB image."""
         _, jpeg = cv2.imencode(
             ".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
         )
@@ -83,7 +83,7 @@ class Screen(ThreadingHTTPServer):
             self._changed.notify_all()
 
     def pictures(self) -> Iterator[bytes]:
-        """Yield images as JPEG, from the current one on; skip those that arrive too fast."""
+        """Yield each new image as JPEG, beginning with the current one; skip images that arrive too fast."""
         shown = 0
         while True:
             with self._changed:
@@ -108,7 +108,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_error(404)
 
     def log_message(self, format: str, *values: object) -> None:
-        """Log nothing, because each request would print a line on the terminal."""
+        """Log nothing; otherwise, each request would print a line on the terminal."""
 
     def _send_headers(self, kind: str) -> None:
         self.send_response(200)
@@ -123,5 +123,5 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(boundary)
         for jpeg in cast(Screen, self.server).pictures():
             header = f"Content-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n".encode()
-            # Send the boundary at once: a browser shows an image only after its final boundary.
+            # Send the boundary at once, because a browser shows an image only after its final boundary.
             self.wfile.write(header + jpeg + boundary)

@@ -1,4 +1,4 @@
-"""The web server of the page: limits, allowed hosts, signals."""
+"""Web server for the page, with limits, allowed hosts and signal handling."""
 
 import importlib.resources
 import os
@@ -27,7 +27,7 @@ def make_server(folder: Path, names: Sequence[str] | None, provider: str = CPU) 
 
     Args:
         folder: Folder for uploads and results.
-        names: Allowed values of the Host header; None allows any.
+        names: Allowed values of the Host header; None allows all values.
         provider: Hardware that runs the network.
     """
     os.environ["GRADIO_TEMP_DIR"] = str(folder)
@@ -69,12 +69,12 @@ def _make_theme() -> gr.themes.Base:
 def serve(
     listener: socket.socket, names: Sequence[str] | None, *, browsed: str | None = None, provider: str = CPU
 ) -> None:
-    """Serve the page on a listening socket until a signal stops it; then remove all uploads.
+    """Serve the page on a listening socket until a signal arrives, then remove all uploads.
 
     Args:
         listener: The listening socket.
-        names: Allowed values of the Host header; None allows any.
-        browsed: URL to open in the browser; if None, no browser is opened.
+        names: Allowed values of the Host header; None allows all values.
+        browsed: URL to open in a browser; if None, no browser is opened.
         provider: Hardware that runs the network.
     """
     _handle_signals()
@@ -88,10 +88,10 @@ def serve(
 
 
 def _handle_signals() -> None:
-    """Make SIGTERM and SIGHUP end the process with an exception, as Ctrl-C does."""
+    """Make SIGTERM and SIGHUP raise an exception that ends the process, as Ctrl-C does."""
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     hang_up = getattr(signal, "SIGHUP", None)  # missing on Windows
-    # An ignored SIGHUP, as under nohup, stays ignored. An exception inside Uvicorn's loop may hang, so SIGHUP
-    # raises SIGTERM, which ends the loop first.
+    # An ignored SIGHUP, as under nohup, stays ignored. An exception inside Uvicorn's loop may make the
+    # loop hang, so SIGHUP raises SIGTERM, which stops the loop first.
     if hang_up and signal.getsignal(hang_up) is signal.SIG_DFL:
         signal.signal(hang_up, lambda *_: signal.raise_signal(signal.SIGTERM))

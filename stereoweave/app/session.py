@@ -1,4 +1,4 @@
-"""Matching, drawing, measuring and writing for a visitor of the web page, independent of the page itself."""
+"""Matching, drawing, measurement and output for a visitor of the web page, without the user interface."""
 
 import zipfile
 from collections.abc import Callable, Sequence
@@ -24,8 +24,8 @@ from stereoweave.stereo import Estimate, StereoCamera
 
 _LONGER_SIDE_PX = 1280
 _MOST_POINTS = 300_000
-# Multiple of the median depth. The viewer fits all points into view: a few on a far horizon would shrink the
-# rest to a dot.
+# Multiple of the median depth. The viewer fits all points into view, so a few points on a far horizon would
+# shrink the rest to a dot.
 _FARTHEST = 4.0
 # Files up to this total size, reached at about 8 megapixels, are stored twice: individually and in the zip.
 _MOST_ZIPPED_BYTES = 300 * 1024**2
@@ -34,14 +34,14 @@ _NO_METRES = "For metres, give a calibration file, or the focal length and the b
 
 @dataclass(frozen=True, kw_only=True)
 class Session:
-    """A visitor's latest result, the renderer of its views, and the folder of its files."""
+    """A visitor's latest result, the renderer for its views, and the folder that contains its files."""
 
     result: Result
     renderer: Renderer
     folder: Path
 
     def given_px(self, shown_px: tuple[int, int]) -> tuple[int, int]:
-        """Convert column and row in the displayed image to column and row in the full-size one."""
+        """Convert the column and row of a pixel in the displayed image to those in the full-size image."""
         given, shown = self.result.pair.left.shape[1::-1], self.renderer.pair.left.shape[1::-1]
         column, row = (
             round((at + 0.5) * n / m - 0.5) for at, n, m in zip(shown_px, given, shown, strict=True)
@@ -59,16 +59,17 @@ class Uploads:
 
 
 def match_uploads(uploads: Uploads, folder: Path, report_progress: Callable[[float, str], None]) -> Session:
-    """Match uploaded pictures. Returns the session, which keeps its files in `folder`.
+    """Match uploaded pictures, and return a session that keeps its files in `folder`.
 
-    `report_progress` is called with the fraction done, 0 to 1, and the name of the next step.
+    `report_progress` is called with the completed fraction, from 0 to 1, and the name of the next step.
     """
     if not uploads.pictures:
         raise StereoweaveError("expected a left and a right picture, or one file with both views, found none")
     for file in (*uploads.pictures, uploads.request.calibration):
         if file and not file.exists():
             raise StereoweaveError(
-                f"{file.name}: expected an upload from the last hour, found an expired one; upload it again"
+                f"{file.name}: expected an upload from the last hour, found an expired one; "
+                "upload the file again"
             )
     report_progress(0.1, "reading")
     prepared = prepare(uploads.pictures, uploads.request)
@@ -93,7 +94,7 @@ def write_all(session: Session) -> tuple[list[Path], list[Note]]:
 
 
 def zip_files(file: Path, files: Sequence[Path]) -> Path | None:
-    """Put files into one zip archive without further compression. Returns None if they are too large."""
+    """Put files into an uncompressed zip archive, and return its path; None if the files are too large."""
     if sum(path.stat().st_size for path in files) > _MOST_ZIPPED_BYTES:
         return None
     with zipfile.ZipFile(file, "w") as archive:
@@ -103,9 +104,10 @@ def zip_files(file: Path, files: Sequence[Path]) -> Path | None:
 
 
 def write_cloud(file: Path, result: Result) -> Path | None:
-    """Write the point cloud for the viewer, without the farthest points. Returns None if there are no points.
+    """Write the point cloud for the viewer, and return the file's path; None if there are no points.
 
-    If the camera is unknown, one is assumed. The downloadable file `cloud.glb` has all points.
+    The farthest points are left out; only the downloadable file `cloud.glb` has all points. If the camera is
+    unknown, a plausible camera is assumed.
     """
     pair, estimate = result.pair, result.estimate
     seen = pair if pair.camera else replace(pair, camera=_assume_camera(estimate))
@@ -150,7 +152,7 @@ def mark_clicks(
 
 
 def measure_clicks(session: Session, clicks: Sequence[tuple[int, int]]) -> list[str]:
-    """Describe each clicked point, and the distance between two, in one line each."""
+    """Describe each clicked point in one line, and the distance between two points in another."""
     estimate, camera = session.result.estimate, session.result.pair.camera
     points = [session.given_px(click) for click in clicks]
     lines = [_describe_pixel(session.result, point) for point in points]
@@ -189,9 +191,10 @@ def _describe_pixel(result: Result, point: tuple[int, int]) -> str:
 
 
 def _assume_camera(estimate: Estimate) -> StereoCamera:
-    """Return a camera that gives a plausible point cloud: 53 degrees of view, the baseline of human eyes.
+    """Return a camera that gives a plausible point cloud.
 
-    Negative disparities mean converged cameras: the lowest disparities are then taken to be infinitely far.
+    It has a field of view of 53 degrees and a baseline of 65 mm, as between human eyes. Negative disparities
+    indicate converged cameras; points with the lowest disparities are then assumed to be infinitely far away.
     """
     height, width = estimate.disparity_px.shape
     return StereoCamera(

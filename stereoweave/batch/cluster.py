@@ -1,9 +1,9 @@
-"""Depth estimation for very many pairs and videos, by workers on one or many machines.
+"""Depth estimation for large numbers of pairs and videos, by workers on one or many machines.
 
 Pictures and results are in folders or object stores. Parquet files hold the plan and the rows of each chunk
 (`manifest`); this module distributes chunk numbers to the workers. Rerun the same command to resume after any
-interruption: chunks that have rows are only checked, and all others are processed. In a folder, a second
-concurrent run is refused. In an object store, two concurrent runs do all work twice but damage nothing.
+interruption; chunks that have rows are only checked, and all others are processed. In a folder, a second
+concurrent run is refused. In an object store, two concurrent runs do all the work twice but damage nothing.
 """
 
 import json
@@ -33,7 +33,7 @@ from stereoweave.pictures.pair_finding import BATCH_FILE
 from stereoweave.system.progress import progress
 from stereoweave.system.ray_engine import Engine, connect, count_slots, stream
 
-# Ray Data keeps state per task. Above this number of chunks, several share a task.
+# Ray Data keeps state per task. Above this number of chunks, several chunks share a task.
 _MOST_TASKS = 2000
 
 
@@ -43,10 +43,10 @@ class ClusterTally:
 
     Attributes:
         made: Number of pairs and videos processed.
-        there: Number finished by earlier runs.
-        failed: Number that failed.
+        there: Number of pairs and videos finished by earlier runs.
+        failed: Number of pairs and videos that failed.
         named: Names and errors of the first failures.
-        manifest: Path or URL of the folder of Parquet files, which hold a row for each pair or video.
+        manifest: Path or URL of the folder of Parquet files that hold a row for each pair or video.
     """
 
     made: int
@@ -66,28 +66,28 @@ def run_cluster(
 ) -> ClusterTally:
     """Process every unfinished pair and video in the source, and write a row for each.
 
-    Results are written to destination/name. A pair gets the files that `depth` writes for many pairs; a video
-    gets depth.mkv, its disparity in 16-bit grey. All machines of a cluster must see the source and the
-    destination under the same paths or URLs.
+    Results are written to destination/name: for a pair, the files that `depth` writes for many pairs; for a
+    video, its disparity as 16-bit grey in depth.mkv. All machines in a cluster must be able to access the
+    source and the destination at the same paths or URLs.
 
     Args:
-        source: A folder, or the URL of one in an object store.
-        destination: A new folder or URL, or one that holds an interrupted batch with the same job.
+        source: A folder, or the URL of a folder in an object store.
+        destination: A new folder or URL, or the folder or URL of an interrupted batch with the same job.
         job: Settings for each pair.
         engine: The cluster and its workers; default: this machine.
         console: Console for the progress bar; default: no progress bar.
 
     Raises:
-        StereoweaveError: The source, the destination, the cluster, the model or the provider is unusable or
-            fails, or another run is writing to the destination. Finished results are kept; repeat the call to
-            resume.
+        StereoweaveError: The source, the destination, the cluster, the model or the provider cannot be used
+            or fails, or another run is writing to the destination. Finished results are kept; repeat the call
+            to resume.
     """
     engine = engine or Engine()
     job = _adapt_job(job or DepthJob(), engine)
     console = console or Console(quiet=True)
     source_store, destination_store = _open_store(source), _open_store(destination)
     if job.backend.provider == CPU:
-        replace(job.backend, threads=1).check()  # raise once for an unknown model, not for each pair
+        replace(job.backend, threads=1).check()  # report an unknown model once, not for each pair
     source_store.check_source()
     destination_store.check_destination()
     with _lock_folder(destination_store), connect(engine):
@@ -107,7 +107,7 @@ def run_cluster(
 def run_cluster_command(
     source: str, destination: str, job: DepthJob, engine: Engine, *, as_json: bool = False
 ) -> int:
-    """Run a batch and print its counts. Returns the exit code: 1 if a pair failed, 130 after Ctrl-C."""
+    """Run a batch, print its counts, and return the exit code: 0, 1 if a pair failed, or 130 after Ctrl-C."""
     try:
         tally = run_cluster(source, destination, job, engine, console=Console(stderr=True))
     except KeyboardInterrupt:
@@ -151,27 +151,27 @@ def _process_chunks(worker: ChunkWorker, plan: ChunkPlan, engine: Engine, consol
 
 
 def _check_folders(worker: ChunkWorker) -> ChunkWorker:
-    """Return the worker; raise an error if this machine does not see the source or destination folder."""
+    """Return the worker; raise an error if this machine cannot access the source or destination folder."""
     try:
         for store in (worker.source, worker.destination):
             if store.folder is not None:
                 store.check_source()
     except StereoweaveError as error:
         detailed = error.with_detail(
-            "put it on a disk that all machines of the cluster share, or use an object store"
+            "put the folder on a disk that all machines in the cluster share, or use an object store"
         )
         raise detailed.with_prefix(f"{platform.node()}: ") from error
     return worker
 
 
 def _adapt_job(job: DepthJob, engine: Engine) -> DepthJob:
-    """Return the job without the default report, and with the number of threads of one worker."""
+    """Return the job without the default report, and with the number of threads for one worker."""
     always = tuple(file for file in job.always if file != "report.html")
     return replace(job, always=always, backend=replace(job.backend, threads=engine.threads_each))
 
 
 def _open_store(place: str | Path) -> Store:
-    """Open a folder or URL as a store; make paths absolute, because workers have other working folders."""
+    """Open a folder or URL as a store. Paths become absolute, because workers have other working folders."""
     store = store_at(place)
     return store if store.folder is None else store_at(store.folder.absolute())
 
@@ -182,7 +182,7 @@ def _lock_folder(destination: Store) -> AbstractContextManager[None]:
 
 
 def _claim(destination: Store, job: DepthJob, source: Store) -> None:
-    """Record the batch's settings in the destination.
+    """Record the batch's settings in the destination, or check them against the recorded settings.
 
     Raises:
         StereoweaveError: The destination holds another batch or other files.
@@ -199,7 +199,7 @@ def _claim(destination: Store, job: DepthJob, source: Store) -> None:
 
 
 def _read_job_files(job: DepthJob) -> Iterator[tuple[str, str, bytes]]:
-    """Yield the kind, name and content of each job file that workers on other machines may not see."""
+    """Yield the kind, name and content of each job file that may not exist on other machines."""
     model, calibration = Path(job.backend.model), job.request.calibration
     if str(model).endswith(".onnx") and model.is_file():  # otherwise it is a shipped model
         with reading(model, "a model"):

@@ -1,7 +1,7 @@
 """Depth estimation for many pairs by several processes; an interrupted batch can be resumed.
 
 A pair is finished once its folder has `done.json`, which is written last and records the pictures and a
-summary. `batch.json` records the settings of the whole folder.
+summary. `batch.json` records the settings of the whole batch.
 """
 
 import functools
@@ -70,7 +70,7 @@ def run_batch(
     """Process every unfinished pair, write its results to `out`/name, and write summary.csv.
 
     A pair that fails, or whose process is killed, is reported at once; the others continue. summary.csv has a
-    row for each pair in the folder, including failed pairs and pairs of earlier runs.
+    row for each pair in the folder, including failed pairs and pairs from earlier runs.
 
     Args:
         pairs: Pairs to process unless they are finished.
@@ -81,13 +81,13 @@ def run_batch(
         console: Console for progress and failures.
 
     Raises:
-        StereoweaveError: `out` holds another batch or other files, is in use or cannot be written, the model
-            is unknown, or the provider is unavailable.
+        StereoweaveError: `out` holds another batch or other files, is in use, or cannot be written to. Also
+            raised if the model is unknown or the provider is unavailable.
     """
     processes = min(processes or usable_cores(), max(len(pairs), 1))
     if processes > 1 and job.backend.threads is None:
         job = replace(job, backend=replace(job.backend, threads=1))
-    # Raise once for an unknown model or unavailable provider, not for each pair.
+    # Report an unknown model or an unavailable provider once, not for each pair.
     replace(job.backend, threads=1).check()
     threads = job.backend.threads
     make_folder(out)
@@ -107,10 +107,10 @@ def run_batch(
 def run_batch_command(
     found: FoundPairs, out: Path, job: DepthJob, *, processes: int | None = None, as_json: bool = False
 ) -> int:
-    """Run a batch and print its counts. Returns the exit code: 1 if a pair failed, 130 after Ctrl-C.
+    """Run a batch, print its counts, and return the exit code: 0, 1 if a pair failed, or 130 after Ctrl-C.
 
-    Reports are written only if the job's files include report.html or all, because a report takes as long as
-    all other files together.
+    Reports are written only if the job's files include `report.html` or `all`, because writing a report takes
+    as long as writing all other files together.
     """
     job = replace(job, always=tuple(file for file in job.always if file != "report.html"))
     for note in found.notes:
@@ -160,9 +160,10 @@ def _process_pairs(
 def _collect_outcomes(
     work: Work, pairs: Sequence[NamedPair], processes: int, threads: int | None
 ) -> Generator[Outcome, None, None]:
-    """Yield the outcome of each pair as it finishes.
+    """Yield the outcome of each pair as soon as the pair is finished.
 
-    After a process is killed, each pair that was in progress runs again alone, to find the one responsible.
+    After a process is killed, each pair that was in progress is processed again on its own, to find the pair
+    that is responsible.
     """
     waiting = deque(pairs)
     while waiting:
@@ -174,12 +175,12 @@ def _collect_outcomes(
 def _process_until_killed(
     work: Work, waiting: deque[NamedPair], processes: int, threads: int | None
 ) -> Generator[Outcome, None, list[NamedPair]]:
-    """Yield outcomes of the waiting pairs; return the pairs that were in progress if a process was killed."""
+    """Yield the outcomes of the waiting pairs. If a process is killed, return the pairs in progress."""
     pending: dict[Future[str | None], NamedPair] = {}
     with _start_pool(processes, threads or usable_cores()) as pool:
         try:
             while waiting or pending:
-                # Submit only one pair per process, so that few are in progress if one is killed.
+                # Submit only one pair per process, so that few pairs are in progress if a process is killed.
                 while waiting and len(pending) < processes:
                     pending[pool.submit(work, waiting[0])] = waiting[0]
                     waiting.popleft()
@@ -194,9 +195,10 @@ def _process_until_killed(
 
 @contextmanager
 def _start_pool(processes: int, threads: int) -> Iterator[ProcessPoolExecutor]:
-    """Yield a pool of processes, and terminate them on an error."""
+    """Yield a pool of processes; if an error occurs, terminate the processes."""
     others = multiprocessing.active_children()
-    # Spawn them, because a forked child inherits OpenCV's and ONNX Runtime's threads in an unknown state.
+    # Spawn the processes, because the threads of OpenCV and ONNX Runtime are in an unknown state in a forked
+    # child.
     context = multiprocessing.get_context("spawn")
     with (
         _limit_blas_threads(threads),
@@ -217,8 +219,8 @@ def _start_pool(processes: int, threads: int) -> Iterator[ProcessPoolExecutor]:
 def _limit_blas_threads(threads: int) -> Iterator[None]:
     """Limit the threads of OpenBLAS, NumPy's matrix library, in processes started within the block.
 
-    OpenBLAS reads the environment variable once, when it is loaded. Its threads busy-wait after each matrix
-    product, which would slow down the other processes.
+    OpenBLAS reads an environment variable once, when it is loaded. After each matrix product, its threads
+    busy-wait, and would thus slow down the other processes.
     """
     before = os.environ.get(_BLAS_THREADS)
     os.environ[_BLAS_THREADS] = str(threads)
@@ -231,7 +233,7 @@ def _limit_blas_threads(threads: int) -> Iterator[None]:
 
 
 def _process_pair(out: Path, job: DepthJob, pair: NamedPair) -> str | None:
-    """Process a pair and mark it as finished; return its error in one line, or None on success."""
+    """Process a pair and mark it as finished; return its error as one line, or None on success."""
     try:
         folder, sources = out / pair.name, _describe_sources(pair)
         job = replace(job, backend=_pin(job.backend))
@@ -248,19 +250,19 @@ def _process_pair(out: Path, job: DepthJob, pair: NamedPair) -> str | None:
             temporary.write_text(json.dumps(facts | {"summary": asdict(summary)}), encoding="utf-8")
     except StereoweaveError as error:
         return " ".join(error.format(job.name_of).split())
-    except Exception as error:  # a library may raise any error on a bad picture; the other pairs continue
+    except Exception as error:  # a library may raise any error on a bad picture; other pairs continue
         return " ".join(f"{type(error).__name__}: {error}".split())
     return None
 
 
 @functools.lru_cache(maxsize=1)
 def _pin(backend: Backend) -> PinnedBackend:
-    """Load the network once in this process, and keep it even if its file is replaced."""
+    """Load the network once in this process, and keep it even if the model file is replaced."""
     return backend.pin()
 
 
 def _describe_sources(pair: NamedPair) -> list[list[Any]]:
-    """Return the name, size and modification time of each file of a pair, to detect changes."""
+    """Return the name, size and modification time of each of a pair's files, to detect changes."""
     sources = []
     for path in (*pair.pictures, *([pair.calibration] if pair.calibration else [])):
         with reading(path, "a picture"):
@@ -290,7 +292,7 @@ def _claim(out: Path, job: DepthJob) -> None:
     """Record the batch's settings in the folder; raise an error if it holds another batch or other files."""
     facts, path = job_facts(job), out / BATCH_FILE
     if path.exists():
-        expected = "the description of a batch that stereoweave depth made"
+        expected = "the description of a batch made by stereoweave depth"
         with reading(path, expected):
             found = parse_description(path, path.read_text(encoding="utf-8"), expected)
         check_claim(path, facts, found)
@@ -302,7 +304,7 @@ def _claim(out: Path, job: DepthJob) -> None:
 
 
 def _remove_abandoned_files(out: Path) -> None:
-    """Remove temporary files of killed processes; call this only while no process is writing."""
+    """Remove temporary files left by killed processes; call this only while no process is writing."""
     for folder in out.glob(".stereoweave-*"):
         shutil.rmtree(folder, ignore_errors=True)
     remove_leftovers(out)

@@ -1,8 +1,8 @@
-"""Plan and rows of a large batch, in many Parquet files: no process has to read all of them.
+"""Plan and rows of a large batch, split into many Parquet files so that no process has to read them all.
 
 The files `plan/part-*.parquet` list the pairs and videos with their chunks. The plan is extended, never
 rearranged. Each file `manifest/part-*.parquet` holds the rows of one chunk, and is written after the whole
-chunk is processed.
+chunk has been processed.
 """
 
 import io
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 MANIFEST, PLAN = "manifest", "plan"
 MOST_IN_A_CHUNK = 32
-"""Maximum number of pairs in a chunk, and thus of pairs to repeat after a worker dies."""
+"""Maximum number of pairs in a chunk, and thus the maximum number to repeat after a worker dies."""
 _CHUNKS_PER_WORKER = 8
 _CHUNKS_PER_FILE = 64
 _PART = re.compile(r"part-(\d{8})\.parquet")
@@ -34,9 +34,9 @@ class PlanEntry:
 
     Attributes:
         name: Name of the pair or video, and of its results folder.
-        files: Paths in the source: a left and a right picture, one picture of both views, or a video.
+        files: Paths in the source: a left and a right picture, one picture with both views, or a video.
         versions: Size and version of each file and of the calibration, to detect changes.
-        calibration: Path in the source of the pair's own calibration, if any.
+        calibration: Path of the pair's own calibration in the source, if any.
         is_film: Whether this is a video.
     """
 
@@ -49,7 +49,7 @@ class PlanEntry:
 
 @dataclass(frozen=True)
 class ChunkPlan:
-    """Plan of a batch: numbers of its chunks, count of pairs and videos, and notes for the user."""
+    """Plan of a batch: the numbers of its chunks, the count of pairs and videos, and notes for the user."""
 
     chunks: tuple[int, ...]
     count: int
@@ -57,10 +57,10 @@ class ChunkPlan:
 
 
 def extend_plan(source: Store, destination: Store, workers: int) -> ChunkPlan:
-    """Update the plan in the destination to the source's current files, and return it.
+    """Update the destination's plan to match the source's current files, and return the plan.
 
-    New pairs and videos get new chunks. Entries of changed files get the new versions. Entries of removed
-    files stay.
+    New pairs and videos are added in new chunks. Entries of changed files get the new versions. Entries
+    of removed files are kept.
 
     Args:
         source: Store of the pairs and videos.
@@ -75,10 +75,10 @@ def extend_plan(source: Store, destination: Store, workers: int) -> ChunkPlan:
     listed = find_pairs_among(source.place, versions)
     found = {entry.name: entry for entry in _make_entries(listed.pairs, listed.films, versions)}
     parts = _list_parts(destination, PLAN)
-    # This removes all planned entries from `found`; the new ones remain.
+    # This removes all planned entries from `found`; the new entries remain.
     counts = {part: _update_part(destination, part, found) for part in parts}
     if not (found or counts):
-        raise StereoweaveError(f"{source.place}: expected pairs of pictures or videos, found none")
+        raise StereoweaveError(f"{source.place}: expected videos or pairs of pictures, found none")
     size = max(1, min(MOST_IN_A_CHUNK, len(found) // (_CHUNKS_PER_WORKER * workers)))
     chunks = list(_split_into_chunks(found.values(), size))
     for part, first in enumerate(range(0, len(chunks), _CHUNKS_PER_FILE), max(parts, default=-1) + 1):
@@ -86,7 +86,8 @@ def extend_plan(source: Store, destination: Store, workers: int) -> ChunkPlan:
     numbers = tuple(
         part * _CHUNKS_PER_FILE + chunk for part, sizes in counts.items() for chunk in range(len(sizes))
     )
-    # Remove rows of chunks that are not planned: a plan was lost, or two runs extended it at the same time.
+    # Remove rows of chunks that are not in the plan. Such rows remain if a plan file was lost, or if two runs
+    # extended the plan at the same time.
     for stray in set(_list_parts(destination, MANIFEST)).difference(numbers):
         destination.remove(_part_path(MANIFEST, stray))
     return ChunkPlan(numbers, sum(map(sum, counts.values())), note_left_out(source.place, listed.left_out))
@@ -99,7 +100,7 @@ def read_chunk(destination: Store, chunk: int) -> list[PlanEntry]:
 
 
 def read_rows(destination: Store, chunk: int) -> dict[str, dict[str, Any]]:
-    """Return the rows of a chunk by pair name, or {} if they are not written yet."""
+    """Return the rows of a chunk by pair name, or {} if they have not been written yet."""
     path = _part_path(MANIFEST, chunk)
     if not destination.exists(path):
         return {}
@@ -161,7 +162,7 @@ def _make_entries(
 
 
 def _split_into_chunks(entries: Collection[PlanEntry], size: int) -> Iterator[list[PlanEntry]]:
-    """Yield chunks of `size` pairs, then a chunk for each video, which takes as long as many pairs."""
+    """Yield chunks of `size` pairs, then one chunk per video, because a video takes as long as many pairs."""
     pairs = (entry for entry in entries if not entry.is_film)
     while chunk := list(islice(pairs, size)):
         yield chunk
@@ -169,7 +170,10 @@ def _split_into_chunks(entries: Collection[PlanEntry], size: int) -> Iterator[li
 
 
 def _update_part(destination: Store, part: int, found: dict[str, PlanEntry]) -> list[int]:
-    """Update the entries of a plan file from `found`, remove them from it, and return the chunks' sizes."""
+    """Update the entries of a plan file, and return the sizes of its chunks.
+
+    Entries in `found` replace the file's entries of the same name, and are removed from `found`.
+    """
     chunks = _read_plan(destination.place, part)
     updated = [[found.pop(entry.name, entry) for entry in chunk] for chunk in chunks]
     if updated != chunks:
@@ -178,7 +182,7 @@ def _update_part(destination: Store, part: int, found: dict[str, PlanEntry]) -> 
 
 
 def _write_plan(destination: Store, part: int, chunks: Sequence[Sequence[PlanEntry]]) -> list[int]:
-    """Write a plan file, and return the chunks' sizes."""
+    """Write a plan file, and return the sizes of its chunks."""
     rows = [{"chunk": number, **asdict(entry)} for number, chunk in enumerate(chunks) for entry in chunk]
     _write_table(destination, _part_path(PLAN, part), rows, _make_plan_schema())
     return [len(chunk) for chunk in chunks]
@@ -216,7 +220,7 @@ def _read_table(destination: Store, path: str) -> list[dict[str, Any]]:
     except (pyarrow.ArrowException, ValueError) as error:
         raise FormatError(
             f"{destination.at(path)}: expected a readable Parquet file, found a damaged one "
-            f"({error}); remove it and rerun the same command to write it again"
+            f"({error}); remove the file, and rerun the same command to write it again"
         ) from error
 
 

@@ -1,8 +1,8 @@
-"""Worker of a large batch: processes the pairs of a chunk, then writes their rows.
+"""Worker that processes the pairs in a chunk of a large batch and then writes their rows.
 
 A chunk in progress is marked in the destination. A mark that already exists was left by a killed worker, and
 one of the chunk's pairs may have been the cause. The pairs are then processed in a child process, which can
-be killed without ending the worker.
+be killed without stopping the worker.
 """
 
 import errno
@@ -38,7 +38,7 @@ ManifestRow = dict[str, Any]
 BEGUN = "begun"
 FILM = "depth.mkv"
 _NAMED_FAILURES = 5
-# The pair is not always at fault: a process may also be killed because others need memory.
+# The pair is not always at fault: a process may also be killed because other processes need memory.
 _MOST_TRIES = 3
 # An error is raised after this many consecutive processes are killed during startup.
 _MOST_FALSE_STARTS = 10
@@ -53,9 +53,9 @@ class Counts:
     """Counts of pairs and videos by outcome.
 
     Attributes:
-        made: Number processed.
-        there: Number finished by earlier runs.
-        failed: Number that failed.
+        made: Number of pairs and videos processed.
+        there: Number of pairs and videos finished by earlier runs.
+        failed: Number of pairs and videos that failed.
         named: Names and errors of the first failures.
     """
 
@@ -76,7 +76,7 @@ class Counts:
 
 @dataclass(frozen=True)
 class ChunkWorker:
-    """Processes planned pairs and videos.
+    """Callable that processes planned pairs and videos.
 
     Attributes:
         source: Store of the pictures and videos.
@@ -92,11 +92,11 @@ class ChunkWorker:
     job_files: tuple[tuple[str, str, bytes], ...] = ()
 
     def __call__(self, chunks: Sequence[int]) -> Counts:
-        """Process the unfinished pairs of several chunks, and return the counts of all their pairs."""
+        """Process the unfinished pairs in several chunks, and return the counts of all pairs."""
         return sum(map(self.make_chunk, chunks), Counts())
 
     def make_chunk(self, chunk: int) -> Counts:
-        """Process the missing, failed and changed pairs of a chunk, write its rows, and return its counts."""
+        """Process the missing, failed and changed pairs in a chunk, write the rows, and return the counts."""
         entries, rows = read_chunk(self.destination, chunk), read_rows(self.destination, chunk)
         missing = [entry for entry in entries if not self._is_done(entry, rows.get(entry.name))]
         mark = f"{BEGUN}/{chunk:08d}.json"
@@ -130,7 +130,7 @@ class ChunkWorker:
         return [self.make_row(entry) for entry in missing]
 
     def _make_rows_in_child(self, missing: Sequence[PlanEntry], mark: str) -> list[ManifestRow]:
-        """Process pairs in a child process, with a limited number of attempts each, and return their rows."""
+        """Process pairs in a child process, with limited attempts per pair, and return their rows."""
         marked = self._read_mark(mark)
         tries, rows = marked.get("tries", {}), {row["pair"]: row for row in marked.get("rows", [])}
         with _RowProcess(self) as child:
@@ -154,10 +154,10 @@ class ChunkWorker:
             return {}
 
     def make_row(self, entry: PlanEntry) -> ManifestRow:
-        """Process a pair or video and return its row. An error of this pair alone is recorded in the row.
+        """Process a pair or video and return its row, which records any error that concerns only this pair.
 
         Raises:
-            StereoweaveError: The source, the destination or the provider has failed for all pairs.
+            StereoweaveError: The source, the destination or the provider fails for every pair.
         """
         start_s = time.perf_counter()
         row, job = self._make_empty_row(entry), self._loaded_job
@@ -169,7 +169,7 @@ class ChunkWorker:
                     row |= self._process_pair(entry, Path(name), job)
             except _StoreError:
                 raise
-            except Exception as error:  # a library may raise any error on a bad picture; the others continue
+            except Exception as error:  # a library may raise any error on a bad picture; other pairs continue
                 self._check_disk(error)
                 if any(isinstance(cause, ProviderError) for cause in _list_causes(error)):
                     _check_provider(job.backend.matcher())
@@ -254,7 +254,7 @@ class ChunkWorker:
 
     @contextmanager
     def _open_results(self, entry: PlanEntry, scratch: Path) -> Iterator[Path]:
-        """Yield a folder for the results; afterwards upload them if the destination is an object store."""
+        """Yield a folder for the results; then upload them if the destination is an object store."""
         if self.destination.folder is not None:
             folder = self.destination.folder / entry.name
             remove_abandoned(folder)
@@ -272,7 +272,7 @@ class ChunkWorker:
                 self.destination.remove(stale)
 
     def _check_disk(self, error: Exception) -> None:
-        """Raise an error if a disk is full or gone, because all further pairs would fail too."""
+        """Raise an error if a disk is full or unavailable, because all further pairs would fail too."""
         if any(isinstance(cause, OSError) and cause.errno in _DISK_ERRNOS for cause in _list_causes(error)):
             raise _StoreError.from_error(error).with_prefix(f"{self.destination.place}: ") from error
 
@@ -336,7 +336,7 @@ class _RowProcess:
                 if false_starts == _MOST_FALSE_STARTS:
                     raise StereoweaveError(
                         f"{platform.node()}: the child process was killed {false_starts} times in a row "
-                        "while it loaded the network; did it run out of memory?"
+                        "while loading the network; did it run out of memory?"
                     ) from error
             finally:
                 if self._pool is None:
@@ -358,7 +358,10 @@ _child_worker: ChunkWorker | None = None
 
 
 def _load_worker(worker: ChunkWorker) -> None:
-    """Store a worker in this child process, and load its network before an attempt at a pair is counted."""
+    """Store a worker in this child process, and load its network.
+
+    Loading is a separate step so that a failure does not count as an attempt at a pair.
+    """
     global _child_worker
     _child_worker = worker
     worker._loaded_job  # noqa: B018 - loads the network
@@ -372,9 +375,9 @@ def _make_row_in_child(entry: PlanEntry) -> ManifestRow:
 
 @functools.cache
 def _write_job_file(name: str, content: bytes) -> Path:
-    """Write a file sent by the driver to this machine's disk, and return its path.
+    """Write a job file to this machine's disk, and return its path.
 
-    The file is removed when this process ends.
+    The file is removed when this process exits.
     """
     path = Path(_make_scratch_folder().name, name)
     path.write_bytes(content)
@@ -387,7 +390,7 @@ def _make_scratch_folder() -> "tempfile.TemporaryDirectory[str]":
 
 
 def remove_abandoned(folder: Path) -> None:
-    """Remove old temporary files of killed workers from a folder."""
+    """Remove old temporary files that killed workers left in a folder."""
     for path in folder.glob(".*"):
         with suppress(FileNotFoundError):
             if time.time() - path.stat().st_mtime < _ABANDONED_AFTER_S:
@@ -399,7 +402,10 @@ def remove_abandoned(folder: Path) -> None:
 
 
 def _check_provider(matcher: Matcher) -> None:
-    """Raise an error if the provider fails even on the smallest pair, which cannot be too large for it."""
+    """Raise an error if the provider fails even on the smallest pair.
+
+    Such a failure cannot be due to the pair's size.
+    """
     plain = np.zeros((SMALLEST_SIDE_PX, SMALLEST_SIDE_PX, 3), np.uint8)
     matcher.estimate(plain, plain)
 

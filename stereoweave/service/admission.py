@@ -1,4 +1,4 @@
-"""Admission of requests by their estimated time, before their pictures are decoded."""
+"""Admission of requests by estimated processing time, before the pictures are decoded."""
 
 import math
 from collections import deque
@@ -12,12 +12,12 @@ from stereoweave.service.answers import ServiceJob, TooLargeError
 # Factors by which large pictures and refinement increase the time per pixel. Checks and rectification are not
 # counted, because they take a fraction of a second at any size.
 _LARGE_FROM_MEGAPIXELS, _LARGE, _REFINED = 2, 2.5, 1.3
-# Number of recent speeds to keep, enough that one or two outliers hardly change their median.
+# Number of recent speeds to keep; with this many, one or two outliers hardly change the median.
 _LATEST = 9
 
 
 class BusyError(StereoweaveError):
-    """Error for a request that would be late only because of requests accepted before it."""
+    """Error for a request that would be late only because of previously accepted requests."""
 
     def __init__(self, message: str, retry_after_s: int = 1) -> None:
         super().__init__(message)
@@ -25,10 +25,10 @@ class BusyError(StereoweaveError):
 
 
 class Budget:
-    """Accepted work of one process, and the time that the process takes per unit of `estimate_work`.
+    """Accepted work of one process, and the time that the process takes per unit of work.
 
-    A request is refused for good if it could not finish in time even at the best speed so far. It is refused
-    for now if it would be late, after all accepted requests, at the usual speed: the median of recent speeds.
+    A request is refused permanently if it could not finish in time even at the best speed so far. It is
+    refused temporarily if, at the median of recent speeds, it would be late after all accepted requests.
     """
 
     def __init__(self, seconds_each: float) -> None:
@@ -41,8 +41,8 @@ class Budget:
         """Accept a job, and count its work until the end of the block.
 
         Raises:
-            TooLargeError: If the job alone takes longer than `left_s`.
-            BusyError: If the job and those accepted before it together take longer than `left_s`.
+            TooLargeError: If the job alone would take longer than `left_s`.
+            BusyError: If the job would take longer than `left_s` after all previously accepted jobs.
         """
         work = estimate_work(job, megapixels)
         least_s = work * self._best_each_s
@@ -54,7 +54,7 @@ class Budget:
         late_s = (sum(self._accepted) + work) * median(self._latest_each_s) - left_s
         if self._accepted and late_s > 0:
             raise BusyError(
-                f"pending requests would make this one {late_s:.0f} s late; try again later",
+                f"pending requests would make this request {late_s:.0f} s late; try again later",
                 retry_after_s=math.ceil(late_s),
             )
         self._accepted.append(work)
@@ -64,17 +64,17 @@ class Budget:
             self._accepted.remove(work)
 
     def learn(self, work: float, took_s: float, *, finished: bool = True) -> None:
-        """Update the speeds with the time that work took until it was finished or stopped."""
+        """Update the speeds with the duration of work that was finished or stopped."""
         each_s = took_s / work
         if finished:
             self._best_each_s = min(self._best_each_s, each_s)
-        else:  # the whole work would have taken longer
+        else:  # all the work would have taken longer
             each_s = max(each_s, median(self._latest_each_s))
         self._latest_each_s.append(each_s)
 
 
 def estimate_work(job: ServiceJob, megapixels: float) -> float:
-    """Return the work of a job; one unit is a megapixel of small pictures, matched without refinement."""
+    """Return the amount of work in a job. One unit is a megapixel of small pictures, without refinement."""
     large = _LARGE if megapixels > _LARGE_FROM_MEGAPIXELS else 1
     refined = _REFINED if job.match_options.refined else 1
     return megapixels * large * refined

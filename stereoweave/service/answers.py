@@ -1,4 +1,4 @@
-"""Answers of the service: a pair's disparity, depth or view, as the bytes of a file."""
+"""The service's answers: a pair's disparity, depth or view, as the bytes of a file."""
 
 import json
 import re
@@ -58,16 +58,16 @@ class ServiceJob:
     """One request to process.
 
     Attributes:
-        folder: Folder of this request's files.
-        pictures: Two pictures, left first, or one that holds both views.
-        file: Name of the file to return: a disparity or depth map of `results.FILES`, or a view, such as
+        folder: Folder that contains this request's files.
+        pictures: Two pictures, left first, or one picture that holds both views.
+        file: Name of the file to return: a disparity or depth map in `results.FILES`, or a view such as
             view.png.
         request: Layout, camera and rectification of the pictures.
         options: Matching options; see `match_options`.
         position: Position of a view.
-        strength: Factor on the baseline, as for `rendering.Renderer`.
+        strength: Factor by which the baseline is multiplied, as in `Renderer`.
         checked: Whether to check the pair and add notes on problems; the job then takes 1.5 times as long.
-        most_megapixels: Maximum size of a view.
+        most_megapixels: Maximum size of each view of the pair, in megapixels.
     """
 
     folder: Path
@@ -91,13 +91,13 @@ class ServiceJob:
 
     @property
     def match_options(self) -> MatchOptions:
-        """The matching options; always refined for views, which show every error at an edge."""
+        """The matching options. Views are always refined, because they show every error at an edge."""
         return replace(self.options, refined=True) if self.is_view else self.options
 
 
 @dataclass(frozen=True, kw_only=True)
 class ServiceAnswer:
-    """The bytes of a file, and its report in JSON: the fields of `Summary`, and notes."""
+    """The bytes of a file, and a JSON report with the fields of `Summary` and the notes."""
 
     content: bytes
     report: str
@@ -127,7 +127,7 @@ def _check_megapixels(path: Path, size_px: tuple[int, ...], most_megapixels: flo
     if megapixels > most_megapixels:
         raise TooLargeError(
             f"{path}: expected at most {most_megapixels:g} megapixels, "
-            f"found {width_px}x{height_px}; scale it down"
+            f"found {width_px}x{height_px} pixels; scale the picture down"
         )
     return megapixels
 
@@ -159,7 +159,7 @@ def answer_many(matcher: Matcher, jobs: Sequence[ServiceJob]) -> list[ServiceAns
 
 
 def field_name(setting: str) -> str | None:
-    """Return the form field for a setting; None if the form does not have it."""
+    """Return the form field for a setting; None if the form has no such field."""
     return _FIELDS.get(setting)
 
 
@@ -196,7 +196,7 @@ def _match_together(
         return results
     if len(prepared) == 1:
         return [results]
-    # Match them one by one, so that one pair's error does not affect the others.
+    # Match the pairs one by one, so that one pair's error does not affect the others.
     return [found for each in prepared for found in _match_together(matcher, options, [each])]
 
 
@@ -204,7 +204,8 @@ def _answer(matcher: Matcher, job: ServiceJob, result: Result) -> ServiceAnswer:
     # Report the network's own name, because the model may be a path on this machine.
     summary = replace(result.summary, model=matcher.name)
     notes = [*result.notes, *(result.warnings() if job.checked else ())]
-    # Do not write to the pictures' folder: it is removed if the client disconnects, and would be made again.
+    # Do not write to the pictures' folder, because it is removed if the client disconnects, and writing would
+    # create it again.
     with TemporaryDirectory(prefix="stereoweave-") as folder:
         path = Path(folder, job.file)
         if job.is_view:
@@ -221,7 +222,7 @@ def _write_map(path: Path, result: Result) -> None:
     except RangeError as error:
         summary = result.summary
         raise StereoweaveError(
-            f"{path.name}: expected disparities of 0 to 255.99 px, the range of a PNG, found "
+            f"{path.name}: expected disparities from 0 to 255.99 px, the range of a PNG, found "
             f"{summary.disparity_min_px:.2f} to {summary.disparity_max_px:.2f} px; request pfm, npy or tiff"
         ) from error
 

@@ -45,7 +45,7 @@ has statistics and notes in JSON; every error is `{"detail": "..."}`."""
 
 
 class Refusal(BaseModel):
-    """An error response: one line that says what was expected, what was found, and the remedy."""
+    """An error response: one line with what was expected, what was found, and a remedy."""
 
     detail: str
 
@@ -59,8 +59,8 @@ _REFUSALS: dict[int | str, dict[str, Any]] = {
         413: "More bytes or pixels than accepted, or more work than the time limit allows.",
         415: "Content type other than multipart/form-data.",
         422: "Unknown, missing or invalid field.",
-        503: "Busy: retry after the number of seconds in the header Retry-After. Or a failure of the disk, "
-        "the memory, the provider or a worker process.",
+        503: "Busy: retry after the number of seconds in the header Retry-After. Also returned if the disk, "
+        "the memory, the provider or a worker process fails.",
         504: "No response within the time limit.",
     }.items()
 }
@@ -80,11 +80,11 @@ class Limits(BaseModel):
 
     Attributes:
         megabytes: Maximum size of a whole request.
-        megapixels: Maximum size of a view.
+        megapixels: Maximum size of each view of a pair.
         timeout_s: Maximum time from the header of a request to the header of its response.
-        waiting: Maximum number of pending requests; further ones are refused.
-        hosts: Allowed values of the header Host; None allows any.
-        token: Bearer token that every request except /health must send; None if no token is required.
+        waiting: Maximum number of pending requests; further requests are refused.
+        hosts: Allowed values of the header Host; None allows all values.
+        token: Bearer token that every request except those to /health must contain; None for no token.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -107,7 +107,7 @@ def make_app(
     """Make the ASGI application of the service.
 
     Args:
-        answer_job: Function that answers a job within a number of seconds.
+        answer_job: Function that answers a job within a given number of seconds.
         limits: Limits on requests.
         folder: Folder that holds uploads until they are processed.
         registry: Metrics to serve at /metrics; if None, there is no such path.
@@ -138,7 +138,10 @@ def make_app(
 
     @app.post("/depth", responses=_list_responses(".png", ".pfm", ".npy", ".tiff"), response_class=Response)
     async def depth(request: Request, form: _MapForm) -> Response:
-        """Estimate the left view's metric depth; needs a camera: calib, focal_px and baseline_m, or EXIF."""
+        """Estimate the left view's metric depth.
+
+        The camera is given by `calib`, by `focal_px` and `baseline_m`, or by EXIF data.
+        """
         return await respond(request, form, f"depth.{form.file}")
 
     @app.post("/view", responses=_list_responses(".png", ".jpg"), response_class=Response)
@@ -155,7 +158,7 @@ def make_app(
 
         @app.get("/metrics", response_class=Response)
         async def metrics() -> Response:
-            """Return request metrics in Prometheus' text format."""
+            """Return request metrics in the Prometheus text format."""
             return Response(generate_latest(registry), media_type="text/plain; version=0.0.4")
 
     return app
@@ -177,7 +180,10 @@ def _join_errors(error: RequestValidationError) -> str:
 
 @dataclass(frozen=True)
 class _Responder:
-    """Callable that responds to a form, whose files are in a separate folder until the response is ready."""
+    """Callable that responds to a form.
+
+    A temporary folder holds the form's files until the response is ready.
+    """
 
     answer_job: JobAnswerer
     most_megapixels: float
@@ -216,7 +222,7 @@ def _make_http_exception(error: Exception, folder: Path) -> HTTPException:
     detail = strip_paths(format_error(error, field_name), folder)
     if not isinstance(error, StereoweaveError | TimeoutError):
         found = detail or "too little memory"
-        detail = f"expected room for the request on disk and in memory, found {found}; try again later"
+        detail = f"the service could not store or process the request ({found}); try again later"
     return HTTPException(_find_status(error), detail, headers)
 
 
@@ -254,7 +260,7 @@ class _Metrics:
 class Guard:
     """Middleware that checks tokens, and limits the number, size, type and time of POST requests.
 
-    If there is a registry for metrics, it also counts and times POST requests.
+    If there is a registry for metrics, the guard also counts and times POST requests.
     """
 
     def __init__(self, app: _Server, limits: Limits, registry: CollectorRegistry | None = None) -> None:
@@ -293,17 +299,20 @@ class Guard:
         if not self._has_token(headers):
             return _refuse_token()
         if self._accepted >= self._limits.waiting:
-            detail = f"expected fewer than {self._limits.waiting} pending requests; try again later"
+            detail = (
+                f"expected fewer than {self._limits.waiting} pending requests, found {self._accepted}; "
+                "try again later"
+            )
             return _make_refusal(503, detail, {"Retry-After": str(_RETRY_AFTER_S)})
         length = headers.get("content-length", "0")
         if length.isdecimal() and int(length) > self._limits.megabytes * 1e6:
             return _make_refusal(413, _describe_size_limit(self._limits))
         if not headers.get("content-type", "").lower().startswith("multipart/form-data"):
-            return _make_refusal(415, "expected the pictures as files of a form of type multipart/form-data")
+            return _make_refusal(415, "expected a multipart/form-data form, found another content type")
         return None
 
     def _has_token(self, headers: Headers) -> bool:
-        """Return whether a request has the required token; True if none is required."""
+        """Return whether a request has the required token; True if no token is required."""
         token = self._limits.token
         if token is None:
             return True
@@ -324,7 +333,10 @@ class Guard:
 
 
 class _Exchange:
-    """A request with a count of its bytes, and the response's status, which is None until it is sent."""
+    """A request of limited size, and the response to it.
+
+    The attribute `status` is None until the response has begun.
+    """
 
     def __init__(self, receive: _Receive, send: _Send, limits: Limits) -> None:
         self._receive, self._send, self._limits = receive, send, limits
@@ -341,7 +353,7 @@ class _Exchange:
         return message
 
     async def send(self, message: _Message) -> None:
-        await self._send(message)  # waits for the client to read; if cancelled meanwhile, nothing was sent
+        await self._send(message)  # waits for the client to read; if cancelled before that, nothing was sent
         self.status = message.get("status", self.status)
 
     async def run_while_connected(self, work: Coroutine[Any, Any, None]) -> None:
@@ -367,7 +379,7 @@ class _Exchange:
         seconds = f"within {self._limits.timeout_s:g} s"
         if self._arrived.is_set():
             return _make_refusal(504, f"expected a result {seconds}, found none; send smaller pictures")
-        return _make_refusal(408, f"expected the whole request {seconds}, found part of it")
+        return _make_refusal(408, f"expected the whole request {seconds}, found only part of it")
 
 
 def _make_refusal(status: int, detail: str, headers: Mapping[str, str] | None = None) -> Response:
@@ -375,7 +387,7 @@ def _make_refusal(status: int, detail: str, headers: Mapping[str, str] | None = 
 
 
 def _refuse_token() -> Response:
-    detail = "expected the header Authorization: Bearer with this service's token, found none or a wrong one"
+    detail = "expected the header Authorization: Bearer with this service's token, found no or a wrong token"
     return _make_refusal(401, detail, {"WWW-Authenticate": "Bearer"})
 
 

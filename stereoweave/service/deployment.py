@@ -41,11 +41,11 @@ NAME = "stereoweave"
 GPU_PROVIDERS = ("cuda", "tensorrt")
 # Requests that resume together reach the batch within this time.
 _GATHERING_S = 0.005
-# All pairs of a batch are in memory at once, so a batch holds fewer large ones.
+# All pairs of a batch are in memory at once, so a batch holds fewer pairs if they are large.
 _MEGAPIXELS_AT_ONCE = 32
-# Number of requests in addition to the waiting ones: they are refused, or only check the service's health.
+# Number of requests beyond the waiting ones. These are refused, or only check the service's health.
 _MOST_QUEUED = 200
-# A replica starts in seconds; the first on a machine also compiles the kernels.
+# A replica starts in seconds; the first replica on a machine also compiles the kernels.
 _TRIAL_LIMIT_S = 120
 _LOGGING = LoggingConfig(log_level="ERROR", enable_access_log=False)
 
@@ -59,7 +59,8 @@ class Settings(BaseModel):
         threads: Number of threads of each replica.
         replicas: Number of replicas; each is a process with its own network.
         batch: Maximum number of pairs to match together. On a CPU, larger batches are no faster: on two
-            cores, a pair of 640x480 px takes 400, 390 and 405 ms in batches of one, two and four.
+            cores, a 640x480 pair takes 400 ms in batches of one, 390 ms in batches of two, and 405 ms in
+            batches of four.
         limits: Limits of each replica.
     """
 
@@ -85,7 +86,7 @@ class Settings(BaseModel):
 
 @serve.ingress()
 class Replica:
-    """A process of the service: it answers jobs and, on a cluster, also HTTP requests."""
+    """A process of the service that answers jobs and, on a cluster, also HTTP requests."""
 
     def __init__(self, settings: Settings) -> None:
         self._settings, self._resources = settings, ExitStack()
@@ -93,7 +94,7 @@ class Replica:
         self._processes = _make_processes(settings, self._folder)
         self._resources.callback(self._processes.close)
         self._budget = Budget(self._processes.warm_up())
-        # One thread per process: a call that waits for the thread is not sent yet, and can be cancelled.
+        # One thread per process: a call that waits for its thread has not been sent and can be cancelled.
         self._measuring_thread, self._answering_thread = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
         self._idle = asyncio.Event()
         self._idle.set()
@@ -101,7 +102,7 @@ class Replica:
             max_batch_size=settings.batch, batch_wait_timeout_s=_GATHERING_S, batch_size_fn=self._count_share
         )(self._answer_batch)
 
-    def __del__(self) -> None:  # Ray Serve calls this to end a replica
+    def __del__(self) -> None:  # Ray Serve calls this to stop a replica
         self._resources.close()
 
     def __serve_build_asgi_app__(self) -> Guard:
@@ -116,12 +117,12 @@ class Replica:
             return error
 
     async def _answer(self, job: ServiceJob, left_s: float) -> ServiceAnswer:
-        """Return the answer to a job. A job that is cancelled while it waits never starts."""
+        """Return the answer to a job. A job that is cancelled while waiting never starts."""
         deadline_s = time.monotonic() + left_s
         loop = asyncio.get_running_loop()
         megapixels = await loop.run_in_executor(self._measuring_thread, self._processes.measure, job, left_s)
         with self._budget.admit(job, megapixels, deadline_s - time.monotonic()):
-            # Otherwise each job that arrives during a match would become a batch of its own.
+            # Otherwise, each job that arrives while others are matched would become a batch of its own.
             await self._idle.wait()
             answer = await self._answer_in_batch(TimedJob(job, megapixels, deadline_s))
         if isinstance(answer, Exception):
@@ -143,7 +144,7 @@ class Replica:
         return answers
 
     def _count_share(self, timed_jobs: Sequence[TimedJob]) -> int:
-        """Return how many places of a batch the jobs fill; a large pair fills several."""
+        """Return the number of places in a batch that the jobs fill; a large pair fills several places."""
         most = self._settings.batch
         return sum(
             min(math.ceil(timed.megapixels * most / _MEGAPIXELS_AT_ONCE), most) for timed in timed_jobs
@@ -151,9 +152,10 @@ class Replica:
 
 
 def application(settings: Settings) -> serve.Application:
-    """Return the service as a Serve application.
+    """Return the service as a Ray Serve application.
 
-    Pass it to `serve.run`, or name it stereoweave.service:application in a Serve config file.
+    Pass the application to `serve.run`, or refer to it as `stereoweave.service:application` in a Serve config
+    file.
     """
     deployed = serve.deployment(
         name=NAME,
@@ -171,12 +173,12 @@ def application(settings: Settings) -> serve.Application:
 
 @contextmanager
 def run_service(settings: Settings, listener: socket.socket, address: str | None = None) -> Iterator[None]:
-    """Run the service within the block, and finish the accepted requests at its end.
+    """Run the service until the end of the block, then finish the accepted requests.
 
     Args:
         settings: Settings of the service.
-        listener: The socket to listen on. On a cluster it is closed, and Ray's own proxies listen on its port
-            on each machine that has a replica.
+        listener: The socket to listen on. On a cluster, it is closed, and Ray's own proxies listen on the
+            same port on each machine that has a replica.
         address: As in `Engine`; the cluster must not serve another application.
 
     Raises:
@@ -186,7 +188,7 @@ def run_service(settings: Settings, listener: socket.socket, address: str | None
     engine = Engine(address, cpus_each=settings.threads, gpus_each=settings.gpus_each)
     if address is None:
         _check_slots(settings, usable_cores() // settings.threads)
-        # Report a network's errors before Ray starts, because starting takes seconds.
+        # Report a network's errors before Ray starts, because starting Ray takes seconds.
         Matcher(settings.model, provider=settings.provider)
     logging.getLogger("ray.serve").setLevel(logging.CRITICAL)
     with connect(engine):
@@ -215,7 +217,7 @@ def _serve_at_server(settings: Settings, listener: socket.socket) -> Iterator[No
                 raise
             except RayActorError as error:
                 raise ProcessDiedError(
-                    "the replica ended before it answered the request; try again later"
+                    "the replica exited before it answered the request; try again later"
                 ) from error
             if isinstance(outcome, Exception):
                 raise outcome
@@ -230,7 +232,7 @@ def _serve_at_server(settings: Settings, listener: socket.socket) -> Iterator[No
 
 @contextmanager
 def _serve_at_proxies(settings: Settings, listener: socket.socket) -> Iterator[None]:
-    """Serve from the HTTP proxies of Ray Serve, one on each machine."""
+    """Serve from Ray Serve's HTTP proxies, one on each machine."""
     host, port = listener.getsockname()[:2]
     listener.close()
     serve.start(http_options={"host": host, "port": port}, logging_config=_LOGGING)
@@ -243,11 +245,14 @@ def _serve_at_proxies(settings: Settings, listener: socket.socket) -> Iterator[N
 
 
 def _check_free(address: str | None) -> None:
-    """Raise an error if the cluster already serves applications: Ray Serve cannot listen on a second port."""
+    """Raise an error if the cluster already serves applications.
+
+    Ray Serve cannot listen on a second port.
+    """
     others = serve.status().applications
     if others:
         raise StereoweaveError(
-            f"{address}: expected a cluster without Serve applications, found {', '.join(others)}; end them "
+            f"{address}: expected a cluster without Serve applications, found {', '.join(others)}; stop them "
             "with `serve shutdown`, or add stereoweave.service:application to their Serve config file"
         )
 
@@ -259,7 +264,7 @@ def _start_replicas(settings: Settings) -> DeploymentHandle[Any]:
     except RuntimeError as error:
         cause = StereoweaveError.from_error(_find_start_error(settings) or error)
         cause = cause.with_prefix("a replica could not load the network: ")
-        raise cause.with_detail("is the model on every machine of the service?") from error
+        raise cause.with_detail("is the model available on every machine of the service?") from error
 
 
 def _find_start_error(settings: Settings) -> StereoweaveError | None:
@@ -267,7 +272,7 @@ def _find_start_error(settings: Settings) -> StereoweaveError | None:
 
     Each machine tries to start a replica's processes, because Ray Serve reports errors only as text.
     """
-    _stop_replicas()  # replicas that did start may leave no room for the trials
+    _stop_replicas()  # replicas that have started may leave no room for the trials
     engine = Engine(cpus_each=settings.threads, gpus_each=settings.gpus_each)
     errors = call_on_each_machine(_try_start, settings, engine, _TRIAL_LIMIT_S)
     return next(filter(None, errors), None)
@@ -288,21 +293,21 @@ def _make_processes(settings: Settings, folder: Path) -> ReplicaProcesses:
 
 
 def _stop_replicas() -> None:
-    """End each replica after it has answered its accepted requests."""
+    """Stop each replica after it has answered its accepted requests."""
     while NAME in serve.status().applications:
         with suppress(TimeoutError):  # raised after a minute, but a request may take longer
             serve.delete(NAME)
 
 
 def _check_slots(settings: Settings, found: int) -> None:
-    """Raise an error if the replicas do not fit: Ray would silently wait for more room."""
+    """Raise an error if the replicas do not fit, because Ray would silently wait for more room."""
     if settings.replicas > found:
         gpu = " and a GPU" if settings.gpus_each else ""
         raise StereoweaveError(
-            f"expected at most {found}, as each takes {settings.threads} cores{gpu}, "
+            f"expected at most {found}, because each takes {settings.threads} cores{gpu}, "
             f"found {settings.replicas}",
             setting="replicas",
-            remedy=Remedy("ask for less", ("replicas", "threads")),
+            remedy=Remedy("use lower values", ("replicas", "threads")),
         )
 
 

@@ -16,8 +16,8 @@ _PREFIX, _LOCK = "stereoweave-service-", ".lock"
 def make_own_folder() -> Iterator[Path]:
     """Make a temporary folder that only this user can read, and remove it at the end of the block.
 
-    A locked file beside the folder marks it as in use. The operating system releases the lock when the
-    process ends, even if it is killed.
+    A locked file beside the folder marks the folder as in use. The operating system releases the lock when
+    the process exits, even if it is killed.
     """
     _remove_abandoned()
     folder = Path(tempfile.gettempdir(), f"{_PREFIX}{uuid4().hex}")

@@ -1,4 +1,4 @@
-"""Forms of the service's requests: their fields, their validation, and storage of their files."""
+"""Forms for requests to the service: their fields, their validation, and the storage of their files."""
 
 import re
 import shutil
@@ -29,7 +29,9 @@ _RANGE = r"^-?\d{1,6}(\.\d{1,6})?,-?\d{1,6}(\.\d{1,6})?$"
 
 def _check_range(text: str | None) -> str | None:
     if text is not None and not re.fullmatch(_RANGE, text):
-        raise ValueError(f"expected the least and greatest disparity, such as -20,150, found {text[:40]!r}")
+        raise ValueError(
+            f"expected the least and the greatest disparity, such as -20,150, found {text[:40]!r}"
+        )
     return text
 
 
@@ -40,7 +42,9 @@ class PairForm(BaseModel):
 
     left: Annotated[UploadFile | None, Field(description="Left picture.")] = None
     right: Annotated[UploadFile | None, Field(description="Right picture, of the same size.")] = None
-    picture: Annotated[UploadFile | None, Field(description="One picture of both views, instead.")] = None
+    picture: Annotated[
+        UploadFile | None, Field(description="One picture with both views, instead of left and right.")
+    ] = None
     format: Annotated[
         Literal[FORMATS] | None,  # type: ignore[valid-type]
         Field(description="Layout of `picture` (default: detected)."),
@@ -50,11 +54,11 @@ class PairForm(BaseModel):
         Field(description="Calibration file: OpenCV, Kalibr, KITTI or Middlebury format."),
     ] = None
     focal_px: Annotated[
-        PositiveFloat | None, Field(description="Focal length in pixels, without a calibration file.")
+        PositiveFloat | None, Field(description="Focal length in pixels, if there is no calibration file.")
     ] = None
     baseline_m: Annotated[
         PositiveFloat | None,
-        Field(description="Distance between the cameras in metres, without a calibration file."),
+        Field(description="Distance between the cameras in metres, if there is no calibration file."),
     ] = None
     rectify: Annotated[bool, Field(description="Rectify the pair first.")] = False
     range: Annotated[
@@ -120,11 +124,11 @@ class ViewForm(PairForm):
     """Fields of a request for a view."""
 
     position: Annotated[
-        FiniteFloat, Field(ge=-1, le=2, description="Viewpoint: 0 is the left camera, 1 the right one.")
+        FiniteFloat, Field(ge=-1, le=2, description="Viewpoint: 0 is the left camera and 1 the right one.")
     ] = 0.5
     strength: Annotated[
         NonNegativeFloat,
-        Field(description="Factor on the baseline; the midpoint of the cameras stays in place."),
+        Field(description="Factor by which the baseline is multiplied about its midpoint."),
     ] = 1.0
     file: Annotated[Literal["png", "jpg"], Field(description="File format.")] = "png"
 
@@ -134,7 +138,7 @@ class ViewForm(PairForm):
 
 
 def store_uploads(form: PairForm, folder: Path, file: str, most_megapixels: float) -> ServiceJob:
-    """Store a form's files in a folder, named by their fields, and return the form's job."""
+    """Store a form's files in a folder, each under its field's name, and return the form's job."""
     uploads = form.uploads()
     for field, upload in uploads.items():
         with (folder / field).open("wb") as out:

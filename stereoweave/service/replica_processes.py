@@ -1,4 +1,4 @@
-"""Child processes of a replica: they match pictures, and are replaced after a timeout or a crash."""
+"""Child processes of a replica, which match pictures and are replaced after a timeout or a crash."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -17,7 +17,7 @@ _SAMPLE = Path(__file__).parents[1] / "sample"
 
 @dataclass(frozen=True)
 class TimedJob:
-    """A job, its megapixels, and its deadline as a value of `time.monotonic`."""
+    """A job, its size in megapixels, and its deadline on the clock of `time.monotonic`."""
 
     job: ServiceJob
     megapixels: float
@@ -30,11 +30,11 @@ class TimedJob:
 
 
 class ReplicaProcesses:
-    """Two child processes: one reads pictures' sizes from their headers, the other matches the pictures.
+    """A child process that reads the sizes of pictures from their headers, and one that matches pictures.
 
     Args:
-        load_answerer: Called in the second process; returns the function that answers jobs. An example is
-            `partial(load_answerer, Backend())`.
+        load_answerer: Function that is called in the second process, and returns the function that answers
+            jobs. An example is `partial(load_answerer, Backend())`.
         folder: Folder for the temporary files of both processes.
     """
 
@@ -43,12 +43,12 @@ class ReplicaProcesses:
         self._answerer = ChildProcess(load_answerer, folder / "answering")
 
     def close(self) -> None:
-        """End both processes."""
+        """Stop both processes."""
         self._measurer.close()
         self._answerer.close()
 
     def warm_up(self) -> float:
-        """Compile all kernels, and return the seconds per megapixel for an unrefined disparity.
+        """Compile all kernels, and return the time in seconds per megapixel for an unrefined disparity.
 
         Raises:
             MatcherError: If the network cannot be loaded.
@@ -65,10 +65,10 @@ class ReplicaProcesses:
         return took_s / self._measurer(plain, timeout_s=None)
 
     def measure(self, job: ServiceJob, left_s: float) -> float:
-        """Return the number of megapixels of a job's pictures, read from their headers.
+        """Return the size of a job's pictures in megapixels, read from their headers.
 
         Raises:
-            StereoweaveError: If `check_pixels` raises one, or the process crashes.
+            StereoweaveError: If `check_pixels` raises an error, or the process crashes.
             TimeoutError: If this takes longer than `left_s`.
         """
         try:
@@ -85,7 +85,7 @@ class ReplicaProcesses:
         """Return each job's answer or error.
 
         If the jobs miss the earliest of their deadlines, or the process crashes, the process is replaced and
-        the jobs are repeated one by one.
+        the jobs are retried one by one.
         """
         try:
             jobs = [timed.job for timed in timed_jobs]

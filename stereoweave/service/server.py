@@ -1,6 +1,6 @@
 """HTTP server of `stereoweave serve`: uvicorn with limits on slow clients and large request headers.
 
-Ray Serve's own proxy has no such limits: it keeps request headers of any length in memory.
+Ray Serve's own proxy has no such limits, and keeps request headers of any length in memory.
 """
 
 import asyncio
@@ -18,7 +18,8 @@ import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 _MOST_HEAD_BYTES = 16 * 1024
-# Bytes to parse at a time: other connections wait while h11 spends 40 us on each chunk, even of one byte.
+# Number of bytes to parse at a time. Other connections wait meanwhile; h11 takes 40 us per chunk, even of one
+# byte.
 _PARSED_BYTES = 4096
 # Each connection takes a file descriptor, and a process usually has 1024. All waiting connections are
 # accepted at once, before any is closed.
@@ -32,7 +33,7 @@ class ClientTimeouts:
     Attributes:
         head_s: Time for all headers of the next request to arrive.
         reader_s: Time for a client to read a response, which stays in memory until then.
-        end_s: Time to finish the requests in progress when the server ends.
+        end_s: Time to finish the requests in progress when the server shuts down.
     """
 
     head_s: float = 10

@@ -22,15 +22,16 @@ _Reply = tuple[Any, Exception | None]
 
 
 class ProcessDiedError(StereoweaveError):
-    """Error for a process that ended in the middle of a call, because it crashed or memory ran out."""
+    """Error for a process that exited in the middle of a call, because it crashed or memory ran out."""
 
 
 class ChildProcess:
     """A function that runs in a child process, one call at a time.
 
     Args:
-        make: Called once in the child; returns the function. It is pickled, as are arguments and results.
-        folder: Folder for the child's temporary files; removed when the child ends.
+        make: Function that is called once in the child, and returns the function to run. `make` is
+            pickled, as are arguments and results.
+        folder: Folder for the child's temporary files; removed when the child exits.
     """
 
     def __init__(self, make: Callable[[], Function], folder: Path) -> None:
@@ -44,7 +45,7 @@ class ChildProcess:
         Raises:
             TimeoutError: If the process has not started in time, or the call takes too long. In the latter
                 case, the process is replaced.
-            ProcessDiedError: If the process ends by itself; it is then replaced.
+            ProcessDiedError: If the process exits on its own; it is then replaced.
             Exception: Any error that the function or `make` raises.
         """
         start_s = time.monotonic()
@@ -68,7 +69,7 @@ class ChildProcess:
         return self._process.pid
 
     def close(self) -> None:
-        """End the child process."""
+        """Stop the child process."""
         self._end()
         self._exchanges.shutdown()
 
@@ -88,25 +89,25 @@ class ChildProcess:
         """Return the result of a reply that has arrived, or raise its error."""
         try:
             result, error = reply.result()
-        # ValueError: the pipes are closed, because the process ended and could not be replaced.
+        # ValueError: the pipes are closed, because the process exited and could not be replaced.
         except (OSError, EOFError, ValueError, pickle.UnpicklingError):
             status = self._replace()
             raise ProcessDiedError(
-                f"the process that worked on the request ended early ({status}): "
-                "a file in the request made it crash, or memory ran out"
+                f"the process that handled the request exited early ({status}); "
+                "either a file in the request made it crash, or memory ran out"
             ) from None
         if error is not None:
             raise error
         return result
 
     def _replace(self) -> str:
-        """Replace the process; return the exit code or signal with which the old one ended."""
+        """Replace the process, and return the exit code or signal of the old process."""
         status = self._end()
         self._start()
         return f"exit code {status}" if status >= 0 else signal.Signals(-status).name
 
     def _end(self) -> int:
-        # If the process has ended by itself, this does not change its status.
+        # If the process has exited on its own, this does not change its status.
         self._process.kill()
         status = self._process.wait()
         for pipe in filter(None, (self._process.stdin, self._process.stdout)):
@@ -127,7 +128,7 @@ def _work() -> None:
     """Make the function, then call it with each message from standard input; this never returns."""
     replies = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # keep libraries' output out of the replies
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent handles it
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the process group; the parent handles it
     messages: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     threading.Thread(target=_receive, args=(messages,), daemon=True).start()
     made: list[Function] = []
@@ -138,7 +139,7 @@ def _work() -> None:
 
 
 def _receive(messages: "queue.SimpleQueue[bytes]") -> None:
-    """Receive messages until the parent ends; then end this process, even in the middle of a call."""
+    """Receive messages until the parent exits; then exit this process, even in the middle of a call."""
     try:
         while True:
             messages.put(pickle.load(sys.stdin.buffer))
@@ -147,7 +148,7 @@ def _receive(messages: "queue.SimpleQueue[bytes]") -> None:
 
 
 def _reply(function: Function, argument: bytes) -> bytes:
-    """Call a function with a pickled argument, and return its result or error, pickled."""
+    """Call a function with a pickled argument, and return its pickled result or error."""
     try:
         return pickle.dumps((function(pickle.loads(argument)), None))
     except Exception as error:

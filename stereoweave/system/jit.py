@@ -1,8 +1,8 @@
 """Compiler settings for the kernels (loops over pixels, compiled by Numba), and a cache of compiled code.
 
 Compiled code is kept in the user's cache folder, never in the package, because an installation may be
-read-only. Kernels that process whole rows use float32 and no branches: the compiler can then vectorise them,
-which makes them three times as fast.
+read-only. Kernels that process whole rows use float32 and no branches, so the compiler can vectorise them and
+they run three times as fast.
 """
 
 import functools
@@ -20,8 +20,8 @@ _SETTINGS: dict[str, typing.Any] = {"nogil": True, "fastmath": True, "error_mode
 compiled = njit(**_SETTINGS)
 """Decorator for a function that kernels call."""
 inlined = njit(forceinline=True, **_SETTINGS)
-"""Decorator for a small function to inline into kernels. It must take arrays, not tuples of arrays: Numba
-would count references to each array at every pixel."""
+"""Decorator for a small function to inline into kernels. The function must take arrays, not tuples of arrays,
+because Numba would otherwise count references to each array at every pixel."""
 
 
 def kernel(function: Callable[..., None]) -> Callable[..., None]:
@@ -40,9 +40,9 @@ def kernel(function: Callable[..., None]) -> Callable[..., None]:
 
 
 def cache_folder() -> Path:
-    """Return the default folder of compiled kernels, in the user's cache folder.
+    """Return the default folder for compiled kernels, in the user's cache folder.
 
-    The environment variable NUMBA_CACHE_DIR overrides it.
+    The environment variable NUMBA_CACHE_DIR overrides this default.
     """
     if sys.platform == "win32":
         base = os.environ.get("LOCALAPPDATA") or "~/AppData/Local"
@@ -57,7 +57,7 @@ def cache_folder() -> Path:
 def _sources_digest() -> str:
     """Return the first 12 hexadecimal digits of a hash of all kernel sources.
 
-    Numba checks only a kernel's own file for changes, and would keep stale code of functions in other files.
+    Numba checks only a kernel's own file for changes, and would keep stale code for functions in other files.
     """
     digest = hashlib.sha256()
     for source in (Path(__file__), *sorted(Path(__file__).parents[1].rglob("*_kernels.py"))):

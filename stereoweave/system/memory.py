@@ -13,12 +13,14 @@ Argument = TypeVar("Argument")
 def peak_memory_mb(make: Callable[[], Callable[[Argument], object]], argument: Argument) -> float:
     """Return the rise in peak resident memory, in 10^6 bytes, while a function is made and called once.
 
-    The rise is measured in a fresh process. It includes what making the function loads, such as a network,
-    and what the first call allocates, such as its result. It excludes what is loaded beforehand: Python,
-    NumPy, OpenCV, ONNX Runtime and the argument. It is NaN on Windows, which does not report peak memory.
+    The rise is measured in a fresh process. It includes everything loaded while the function is made, such as
+    a network, and everything allocated by the first call, such as the result. It excludes everything loaded
+    beforehand: Python, NumPy, OpenCV, ONNX Runtime and the argument. The result is NaN on Windows, where peak
+    memory is not measured.
 
     Args:
-        make: Makes the function. Must be picklable, such as a module-level function or a partial of one.
+        make: Function that makes the function to measure. It must be picklable, such as a module-level
+            function or a `functools.partial` of a module-level function.
         argument: The function's argument.
     """
     import cv2
@@ -38,10 +40,10 @@ def _measure_rise_mb(make: Callable[[], Callable[[Argument], object]], argument:
 
 
 def _read_peak_mb() -> float:
-    """Return this process's peak resident memory so far."""
+    """Return this process's peak resident memory so far, in 10^6 bytes."""
     status = Path("/proc/self/status")
     if status.exists():
-        # Not getrusage, whose peak for a child process starts at the parent's on Linux.
+        # getrusage is not suitable: on Linux, the peak of a child process starts at its parent's peak.
         (line,) = (line for line in status.read_text().splitlines() if line.startswith("VmHWM:"))
         return int(line.split()[1]) * 1024 / 1e6
     if sys.platform == "win32":

@@ -7,7 +7,7 @@ import threading
 
 
 def begin_work(threads: int) -> None:
-    """Set up a worker process: limit OpenCV's threads, ignore Ctrl-C, and end when the parent ends."""
+    """Set up a worker process: limit OpenCV's threads, ignore Ctrl-C, and exit when the parent exits."""
     import cv2
 
     cv2.setNumThreads(threads)

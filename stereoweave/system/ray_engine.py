@@ -1,4 +1,4 @@
-"""Engine that runs tasks on one or many machines, as a stream through a pool of Ray Data workers."""
+"""Engine that streams tasks through a pool of Ray Data workers on one or many machines."""
 
 import logging
 import math
@@ -29,21 +29,22 @@ ResultT = TypeVar("ResultT")
 _CONNECT_TIMEOUT_S, _STATUS_TIMEOUT_S = 10, 20
 # The object store carries only tasks and results.
 _OBJECT_STORE_BYTES = 200_000_000
-# Seconds between two checks of a cluster's machines, and seconds that a lost machine has to return.
+# Interval between checks of a cluster's machines, and the time that a lost machine has to return.
 _CHECKED_EVERY_S, _RETURNS_WITHIN_S = 2, 10
 # Ray counts cores and GPUs at this resolution.
 _LEAST_SHARE = 0.0001
 # The run fails after this many consecutive workers die while starting.
 _MOST_FALSE_STARTS = 20
 _QUIET_ENVIRONMENT = {
-    # Hide deprecation warnings, and errors of Ray's C++ code: errors that matter are also raised in Python.
+    # Hide deprecation warnings, and errors from Ray's C++ code; important errors are also raised in Python.
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
     "RAY_BACKEND_LOG_LEVEL": "fatal",
     # Keep the cluster's logs, with a line for each killed worker, off standard output.
     "RAY_DEDUP_LOGS_SKIP_REGEX": ".*",
 }
 # If this is 0, the default on macOS and Windows, a Ray instance started here uses the loopback address for
-# its machine and listens only there. A loopback address passed to `ray.init` has no effect: Ray replaces it.
+# its machine and listens only there. A loopback address passed to `ray.init` has no effect, because Ray
+# replaces it.
 _OPEN_TO_OTHER_MACHINES = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
 _INDEX, _CONTENT = "index", "content"
 
@@ -55,7 +56,7 @@ class Engine:
     Attributes:
         address: The cluster's head as host:port or ray://host:port; "auto" for a Ray instance already
             running on this machine; "local" to start Ray on this machine for the duration of the work.
-            Default: the address in RAY_ADDRESS, or "local" if that is not set.
+            Default: the address in RAY_ADDRESS, or "local" if RAY_ADDRESS is not set.
         workers: Maximum number of workers; default: as many as fit.
         cpus_each: Number of cores reserved for each worker; fractions are allowed.
         gpus_each: Number of GPUs reserved for each worker; at 0.25, four workers share a GPU.
@@ -76,7 +77,7 @@ class Engine:
         gpus = self.gpus_each
         if gpus and not (_LEAST_SHARE <= gpus < 1 or (1 <= gpus < math.inf and gpus % 1 == 0)):
             raise StereoweaveError(
-                f"expected 0, a fraction of 1 or a whole number, found {gpus}", setting="gpus_each"
+                f"expected 0, a fraction below 1, or a whole number, found {gpus}", setting="gpus_each"
             )
 
     @property
@@ -113,7 +114,7 @@ def connect(engine: Engine) -> Iterator[None]:
         already = "ray" in sys.modules and sys.modules["ray"].is_initialized()
         if address and not already:
             distribution("ray")  # raises ModuleNotFoundError without importing Ray
-            _check_head(address)  # before the import, which reads whether to send a token
+            _check_head(address)  # before the import, during which Ray reads whether to send a token
         import ray
     if already:
         yield
@@ -130,17 +131,18 @@ def stream(
 ) -> Generator[ResultT, None, None]:
     """Yield the tasks' results as they arrive, in any order.
 
-    If a worker or a machine dies, its tasks run again: a task may run twice, but its result is yielded once.
-    If a machine does not return, the other machines take over its tasks. Memory grows by less than a kilobyte
-    per task, so thousands of tasks are fine.
+    If a worker or a machine dies, its tasks run again. A task may run twice, but its result is yielded only
+    once. If a machine does not return, the other machines take over its tasks. Memory use grows by less than
+    a kilobyte per task, so there can be thousands of tasks.
 
     Args:
-        make_worker: Called once in each worker's process; returns the function to call with each task.
+        make_worker: Function that is called once in each worker's process, and returns the function to call
+            with each task.
         tasks: Small values that can be pickled; workers load larger data themselves.
         engine: The cluster and its workers.
 
     Raises:
-        StereoweaveError: If a worker raises one, the cluster cannot be reached, or no worker fits on it.
+        StereoweaveError: If a worker raises one, the cluster cannot be reached, or no machine fits a worker.
     """
     with connect(engine):
         waiting = dict(enumerate(tasks))
@@ -161,7 +163,7 @@ def call_on_each_machine(
     Each call reserves a worker's resources. This process must be a driver of the cluster; see `connect`.
 
     Returns:
-        The results, except from machines that fail or do not answer in time.
+        The results from all machines that neither fail nor exceed the time limit.
     """
     import ray
     from ray.exceptions import RayError
@@ -213,7 +215,7 @@ def _run_tasks(
 def _make_dataset(
     make_worker: Callable[[], Callable[[TaskT], ResultT]], tasks: dict[int, TaskT], engine: Engine
 ) -> "Dataset":
-    """Return a lazy dataset of the results; the tasks run while it is read."""
+    """Return a lazy dataset of the results; the tasks run while the dataset is read."""
     from ray.data import ActorPoolStrategy, DataContext, from_items
 
     logging.getLogger("ray.data").setLevel(logging.CRITICAL)
@@ -232,7 +234,7 @@ def _make_dataset(
 
 
 def _make_context(engine: Engine) -> "DataContext":
-    """Return Ray Data's settings: no output, and a callback that watches the machines."""
+    """Return settings for Ray Data that turn off its output and add a callback that watches the machines."""
     from ray.data import DataContext
 
     with warnings.catch_warnings(action="ignore"):  # Ray Data warns about its own defaults
@@ -249,9 +251,9 @@ def _make_context(engine: Engine) -> "DataContext":
 
 
 class _Watch:
-    """Callback of Ray Data that ends a run whose workers wait for a lost machine.
+    """Ray Data callback that stops a run whose workers wait for a lost machine.
 
-    Ray restarts such workers if there is room elsewhere. Otherwise their tasks would wait forever.
+    Ray restarts such workers if there is room on other machines. Otherwise, their tasks would wait forever.
     """
 
     def __init__(self, engine: Engine) -> None:
@@ -280,14 +282,14 @@ class _Watch:
 
 
 def count_slots(engine: Engine) -> int:
-    """Return the number of workers that fit on the cluster; raise StereoweaveError if none does."""
+    """Return the number of workers that fit on the cluster; raise StereoweaveError if no worker fits."""
     if slots := _count_slots(engine):
         return slots
     largest = max(_list_machines().values(), key=lambda resources: resources.get("CPU", 0))
     raise StereoweaveError(
         f"expected a machine with {engine.cpus_each:g} cores and {engine.gpus_each:g} GPUs for a worker, "
-        f"found {largest.get('CPU', 0):g} and {largest.get('GPU', 0):g} on the largest; add such a machine",
-        remedy=Remedy("or ask for less", ("cpus_each", "gpus_each")),
+        f"found {largest.get('CPU', 0):g} and {largest.get('GPU', 0):g} on the largest; add a larger machine",
+        remedy=Remedy("or use lower values", ("cpus_each", "gpus_each")),
     )
 
 
@@ -296,7 +298,7 @@ def _count_slots(engine: Engine) -> int:
 
 
 def _list_machines() -> dict[str, dict[str, float]]:
-    """Return the resources of each live machine of the cluster, by machine ID."""
+    """Return the resources of each live machine in the cluster, by machine ID."""
     import ray
 
     nodes: list[dict[str, Any]] = ray.nodes()  # type: ignore[no-untyped-call]
@@ -315,8 +317,8 @@ def _start() -> None:
     """Start Ray on this machine with all cores that this process may use."""
     import ray
 
-    # Ray always starts a dashboard process, which queries the metadata services of three clouds even if usage
-    # reports are off (Ray 2.60). If the port of that process is in use, Ray continues without it.
+    # Ray always starts a dashboard process, which queries the metadata services of three clouds even if
+    # telemetry is off (Ray 2.60). If the port of that process is in use, Ray continues without the process.
     with _mute_stderr(), socket.create_server(("127.0.0.1", 0)) as occupied:
         ray.init(
             address="local",
@@ -336,22 +338,22 @@ def _join(address: str) -> None:
     try:
         with _mute_stderr():
             ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
-    except Exception as error:  # errors of Ray, gRPC and Python have no common base class
+    except Exception as error:  # errors from Ray, gRPC and Python have no common base class
         raise _make_join_error(address, _first_line(error)) from error
 
 
 def _make_join_error(address: str, found: str) -> StereoweaveError:
     return StereoweaveError(
-        f"{address}: expected the head of a Ray cluster, found {found}; "
-        "check that Ray and Python have the cluster's versions, and that this machine has its token"
+        f"{address}: expected the head of a Ray cluster, found none that can be joined ({found}); "
+        "check that this machine has the cluster's token and the same versions of Ray and Python"
     )
 
 
 def _check_head(address: str) -> None:
     """Raise an error if no Ray head answers.
 
-    Otherwise `ray.init` would retry for minutes, then end the process. For Ray Client (ray://) only the port
-    is checked: `ray.init` then gives up after half a minute, and raises an error itself.
+    Otherwise, `ray.init` would retry for minutes and then exit the process. For Ray Client (ray://), only the
+    port is checked, because `ray.init` then gives up after half a minute and raises an error itself.
     """
     try:
         if address != "auto":
@@ -361,7 +363,7 @@ def _check_head(address: str) -> None:
     except (OSError, subprocess.TimeoutExpired) as error:
         found = _first_line(error) if isinstance(error, OSError) else f"no reply in {_STATUS_TIMEOUT_S} s"
         raise StereoweaveError(
-            f"{address}: expected the head of a Ray cluster, found {found}; "
+            f"{address}: expected the head of a Ray cluster, found none ({found}); "
             "is it running, and does the firewall let this machine through?"
         ) from error
 
@@ -379,10 +381,11 @@ def _check_port(address: str) -> None:
 def _check_status(address: str) -> None:
     """Raise an error if `ray status` fails; make Ray send its token if the head requires one.
 
-    By default, Ray sends none. If it sends one to a head that requires none, actors end at once (Ray 2.60).
+    By default, Ray sends no token. If Ray sends a token to a head that requires none, actors exit at once
+    (Ray 2.60).
 
     Raises:
-        StereoweaveError: The head refused the version or the token.
+        StereoweaveError: The head rejected the version or the token.
         subprocess.TimeoutExpired: No Ray head replied in time.
     """
     status = _run_status_command(address)
@@ -403,7 +406,10 @@ def _run_status_command(address: str) -> subprocess.CompletedProcess[str]:
 
 @contextmanager
 def _mute_stderr() -> Iterator[None]:
-    """Discard standard error within the block: Ray's C++ code prints a line about RAY_BACKEND_LOG_LEVEL."""
+    """Discard standard error within the block.
+
+    Otherwise, Ray's C++ code would print a line about RAY_BACKEND_LOG_LEVEL.
+    """
     sys.stderr.flush()
     kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 2)
@@ -426,7 +432,7 @@ def _last_line(error: Exception) -> str:
 
 
 class _TaskRunner:
-    """Callable that Ray Data creates once in each worker process, and calls once for each task."""
+    """Callable that Ray Data creates once in each worker process and calls once for each task."""
 
     def __init__(self, make_worker: Callable[[], Callable[[Any], Any]], threads: int) -> None:
         import cv2
@@ -441,7 +447,7 @@ class _TaskRunner:
     def _run_task(self, content: bytes) -> bytes:
         """Run a task, and return its pickled result, or its pickled error for the driver to raise.
 
-        Ray's own report of an error would have many lines.
+        Ray's own error report would have many lines.
         """
         try:
             if self._worker is None:

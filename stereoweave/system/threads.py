@@ -1,4 +1,4 @@
-"""Number of threads, and work on bands of image rows in several threads."""
+"""The number of threads to use, and parallel work on bands of image rows."""
 
 import os
 from collections.abc import Callable
@@ -11,7 +11,7 @@ _MOST_THREADS = 1024
 
 
 def thread_count(threads: int | None) -> int:
-    """Return the number of threads to use: as requested, or by default one per usable core.
+    """Return the number of threads to use: the requested number, or one per usable core by default.
 
     Raises:
         StereoweaveError: The requested number is out of range.

@@ -1,4 +1,4 @@
-"""Conversion of a stereo video: matching, temporal filter, and rendering of depth, a view or a layout."""
+"""Conversion of a stereo video: matching, temporal filtering, and rendering of depth, a view or a layout."""
 
 import hashlib
 from collections.abc import Iterable, Iterator, Sequence
@@ -68,8 +68,8 @@ def convert_video(
 
     Args:
         video: The input video.
-        sources: Files of the input; a conversion resumes only if they are unchanged.
-        out: Output file, whose ending selects the container.
+        sources: Input files; a conversion resumes only if they are unchanged.
+        out: Output file; its extension selects the container.
         job: Settings of the conversion.
         console: Console for notes on the video and for progress.
 
@@ -77,15 +77,15 @@ def convert_video(
         Counts for the whole conversion, including interrupted runs.
 
     Raises:
-        StereoweaveError: `out` has an unsuitable ending, is in use, or cannot be written, for example because
-            the disk is full.
+        StereoweaveError: `out` has an unsuitable extension, is in use, or cannot be written to, for example
+            because the disk is full.
     """
     _check_output(out, job, video, sources)
     matcher = job.backend.matcher()
     recorder = Recorder(
         encoding=GREY16 if job.depth16 else H264,
         time_base=video.time_base,
-        # FFmpeg stores the terms of a fraction in 32 bits.
+        # FFmpeg stores numerators and denominators in 32 bits.
         rate=video.rate.limit_denominator(100_000),
         packing=PACKINGS.get(job.layout or ""),
         threads=thread_count(job.backend.threads),
@@ -124,7 +124,7 @@ class _FrameConverter:
 
     @classmethod
     def from_state(cls, job: VideoJob, matcher: Matcher, state: dict[str, np.ndarray]) -> "_FrameConverter":
-        """Restore a converter from a saved `state`. It continues exactly as the original would have."""
+        """Restore a converter from a saved `state`; its output is the same as without an interruption."""
         low_px, high_px, middle_px, *match_range_px = state.pop("survey_px").tolist()
         survey = Survey(
             (low_px, high_px), middle_px, (match_range_px[0], match_range_px[1]) if match_range_px else None
@@ -136,7 +136,7 @@ class _FrameConverter:
         return converter
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return the state as arrays: everything that affects the output of later frames."""
+        """Return everything that affects the output of later frames, as arrays by name."""
         tally = self.tally
         return {
             "survey_px": np.array(
@@ -164,11 +164,13 @@ class _FrameConverter:
 def _check_output(out: Path, job: VideoJob, video: StereoVideo, sources: Sequence[Path]) -> None:
     if job.depth16 and out.suffix.lower() != ".mkv":
         raise StereoweaveError(
-            f"{out}: expected a file name ending in .mkv for 16-bit depth, found {out.suffix!r}"
+            f"{out}: expected the file extension .mkv for 16-bit depth, found {out.suffix!r}"
         )
     for source in sources:
         if source.exists() and out.exists() and out.samefile(source):
-            raise StereoweaveError(f"{out}: expected an output other than the input, found the same file")
+            raise StereoweaveError(
+                f"{out}: expected an output file other than the input, found the same file"
+            )
     check_container(out, video.sound)
 
 

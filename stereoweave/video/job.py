@@ -17,7 +17,7 @@ from stereoweave.video.writer import Picture
 
 _STEPS_PER_PX, _MOST_GREY16_PX = 256, 255.99
 
-# Keys of the saved settings that identify the input and the version, and their names in errors.
+# Keys of the saved settings that identify the input and the version, and their names in error messages.
 _SAVED_FACTS = {"film": "video", "stereoweave": "stereoweave"}
 
 
@@ -29,11 +29,11 @@ class VideoJob:
         depth: Output the left disparity in colour, with one range for the whole video.
         depth16: Output the left disparity as 16-bit grey, px * 256 as in disparity.png. Values are clipped to
             the range from 1/256 to 255.99 px.
-        position: Output the view from this position: 0 is the left camera, 1 the right one.
+        position: Output the view from this position, where 0 is the left camera and 1 the right one.
         layout: Output the layout of this name in `LAYOUTS`.
         strength: Factor by which the baseline is multiplied.
         convergence_px: Disparity of the points that stay in the same column in all views. Default: the median
-            disparity of the scene for layouts that overlay their views, else 0.
+            disparity of the scene for layouts that overlay their views, 0 for all others.
         backend: Backend that matches the frames.
         name_of: Function that returns the front end's name for a setting, used in notes.
     """
@@ -110,25 +110,25 @@ class VideoJob:
         return survey.middle_px if self.layout and LAYOUTS[self.layout].converged else 0.0
 
     def name_of_saved(self, key: str) -> str:
-        """Return the front end's name for a key of the saved settings."""
+        """Return the front end's name for a key in the saved settings."""
         if key in _SAVED_FACTS:
             return _SAVED_FACTS[key]
         setting = "format" if key == "arrangement" else key
         return self.name_of(setting) or setting
 
     def find_losses(self, survey: Survey) -> list[Note]:
-        """Return a note if the output format cannot represent all disparities of the video."""
+        """Return a note if the output format cannot represent all disparities in the video."""
         low_px, high_px = survey.range_px
         if not self.depth16 or (low_px >= 0 and high_px <= _MOST_GREY16_PX):
             return []
         text = (
-            f"16-bit grey covers 0 to {_MOST_GREY16_PX} px; this video's disparities of {low_px:.1f} to "
+            f"16-bit grey covers 0 to {_MOST_GREY16_PX} px; this video's disparities from {low_px:.1f} to "
             f"{high_px:.1f} px are clipped"
         )
         return [Note(text, Remedy("show all of them in colours", ("depth",)))]
 
     def describe_values(self, survey: Survey) -> dict[str, str]:
-        """Return the metadata of the output file, which explains how its pixel values encode disparity."""
+        """Return metadata for the output file that explains how pixel values encode disparity."""
         low_px, high_px = survey.range_px
         if self.depth16:
             return {"comment": f"16-bit grey: disparity of the left view in pixels = value / {_STEPS_PER_PX}"}

@@ -30,7 +30,7 @@ class Parts:
 
     @contextmanager
     def next(self, state: Callable[[], Mapping[str, np.ndarray]]) -> Iterator[Path]:
-        """Provide a path for the next part, which counts as finished once the state after it is saved too."""
+        """Yield a path for the next part, which counts as finished once the state after it is also saved."""
         number = len(self.files) + 1
         part = self.folder / f"{number:06}.nut"
         with replacing(part) as temporary:
@@ -57,18 +57,18 @@ def parts_folder(out: Path) -> Path:
 
 @contextmanager
 def open_parts(out: Path, settings: Mapping[str, object], name_of: NameOf = keyword) -> Iterator[Parts]:
-    """Open the parts of a video so that more can be added.
+    """Open the parts of a video so that more parts can be added.
 
     On success, all parts are removed. After an error, the finished parts are kept.
 
     Args:
         out: The video that the parts will become.
         settings: Input and settings of the conversion, as JSON values.
-        name_of: Function that returns the front end's name for a setting, used in errors.
+        name_of: Function that returns the front end's name for a setting, used in error messages.
 
     Raises:
-        StereoweaveError: The folder contains damaged parts, or parts made with other settings. Also raised
-            for an error in the body after a part was finished, with a note on how to resume.
+        StereoweaveError: The folder contains damaged parts, or parts made with other settings. Also raised if
+            the block fails after a part was finished; the message then says how to resume.
     """
     folder = parts_folder(out)
     parts = Parts(folder)
@@ -101,7 +101,7 @@ def _settings_file(folder: Path) -> Path:
 
 
 def _clear(folder: Path) -> None:
-    """Remove the parts from a folder, and the folder if nothing else is in it."""
+    """Remove the parts from a folder, and then the folder if it is empty."""
     for file in chain(folder.glob("*.npz"), folder.glob("*.nut"), [_settings_file(folder)]):
         file.unlink(missing_ok=True)
     with suppress(OSError):
@@ -116,7 +116,7 @@ def _check_settings(folder: Path, settings: Mapping[str, object], name_of: NameO
     if other:
         begun = ", ".join(_format_setting(name_of(name) or name, found.get(name)) for name in other)
         raise StereoweaveError(
-            f"{folder}: expected parts of the same video, found parts made {begun}; "
+            f"{folder}: expected parts made with the current settings, found parts made {begun}; "
             "remove this folder, or rerun with the same settings"
         )
 
@@ -140,6 +140,6 @@ def _reporting_damage(file: Path) -> Iterator[None]:
         yield
     except (OSError, ValueError, TypeError, EOFError, BadZipFile) as error:
         raise StereoweaveError(
-            f"{file}: expected the saved state of an interrupted video, found no readable file; "
+            f"{file}: expected the saved state of an interrupted conversion, found no readable file; "
             f"remove the folder {file.parent}"
         ) from error

@@ -17,16 +17,16 @@ _REPEATED_LAST, _REPEATED_NEXT = (
     "damaged: replaced by the frame after it",
 )
 _AFTER_DAMAGE = "decoded from a damaged frame before it"
-_RETIMED = "its time stamp was missing or a duplicate, so it is shown slightly later"
+_RETIMED = "its timestamp was missing or a duplicate, so it is shown slightly later"
 
 
 class StereoFrame(NamedTuple):
-    """Pair of frames of a video.
+    """Pair of frames from a video.
 
     Attributes:
         left, right: uint8 RGB [H, W, 3].
         time: Exact time since the start of the video, in seconds.
-        problem: Description of damage to this frame, of a changed time stamp, or of an early end of the
+        problem: Description of damage to this frame, of a changed timestamp, or of an early end of the
             video; None if there is no problem.
     """
 
@@ -43,10 +43,10 @@ class StereoVideo:
         name: Paths of the files, as given by the caller.
         frame_packing: Frame packing, a name in `PAIR_LAYOUTS`; None for two files.
         size_px: Width and height of each eye's image at full size.
-        frame_count: Number of frames that `frames` yields, including damaged ones. If two files differ, the
-            lower number counts.
+        frame_count: Number of frames that `frames` yields, including damaged frames. For two files with
+            different numbers of frames, this is the lower number.
         rate: Average frames per second.
-        time_base: Time unit in seconds, of which every frame time is a multiple.
+        time_base: Time unit in seconds; every frame time is a multiple of this unit.
         sound: File that contains the sound; None for a silent video.
     """
 
@@ -63,11 +63,11 @@ class StereoVideo:
         self.sound = next((track.sound for track in tracks if track.sound), None)
 
     def frames(self, start: int = 0) -> Iterator[StereoFrame]:
-        """Yield the frames from number `start` on, identical to those that a run from 0 yields.
+        """Yield the frames from number `start` on, exactly as if all frames had been read.
 
-        A frame that cannot be decoded is replaced by the last decoded frame. The frames that depend on it,
-        up to the next key frame, are yielded as decoded. The `problem` of a frame describes either
-        case.
+        A frame that cannot be decoded is replaced by the last decoded frame. The frames that depend on the
+        missing frame, up to the next key frame, are yielded as decoded. In both cases, the frame's `problem`
+        says so.
         """
         steps = self._tracks[0].steps
         every_track = zip(*(_bridge_gaps(track, start) for track in self._tracks), strict=False)
@@ -102,7 +102,8 @@ def open_video(
 ) -> StereoVideo:
     """Open a stereo video from one file with both eyes, or from a left and a right file.
 
-    Reads each file once to find the times of all frames, and decodes some frames to detect the frame packing.
+    Each file is read once to find the times of all frames, and some frames are decoded to detect the frame
+    packing.
 
     Args:
         paths: One or two videos, folders of pictures, or glob patterns that match pictures.

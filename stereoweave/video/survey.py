@@ -86,7 +86,7 @@ def _spread_evenly(count: int, wanted: int) -> range:
 def _add_time(time: Fraction, note: Note, video: StereoVideo) -> Note:
     """Return a note with the time of its frame added.
 
-    For swapped views in one file, the remedy becomes the frame packing with the eyes swapped.
+    If the views in a single file are swapped, the remedy names the frame packing with the eyes swapped.
     """
     other = _find_swapped_packing(video.frame_packing)
     if note == SWAPPED and other:
@@ -95,7 +95,7 @@ def _add_time(time: Fraction, note: Note, video: StereoVideo) -> Note:
 
 
 def _select_common_notes(defects: Sequence[list[Note]]) -> list[Note]:
-    """Return the notes on the last frame with any, if at least half of the frames have notes.
+    """Return the notes on the last frame that has notes, if more than half of the frames have notes.
 
     Notes on fewer frames are unreliable, because a video may begin with black frames.
     """
@@ -104,7 +104,7 @@ def _select_common_notes(defects: Sequence[list[Note]]) -> list[Note]:
 
 
 def _find_swapped_packing(frame_packing: str | None) -> str | None:
-    """Return the name of the frame packing with the eyes swapped, or None if there is none."""
+    """Return the name of the frame packing with the eyes swapped, or None if no such packing exists."""
     if frame_packing is None:
         return None
     split = PAIR_LAYOUTS[frame_packing]

@@ -5,8 +5,8 @@ disparity that a pixel shares with its neighbourhood is treated as a true change
 noise. Each pixel becomes the mean over the frames that saw its point.
 
 A pixel restarts if the previous frame does not explain the image, or if the new disparity contradicts the old
-one: immediately near anything that moves in either view, and by majority vote where everything is at rest.
-Moving objects therefore leave no trail.
+one. Near anything that moves in either view, one contradiction suffices; where everything is at rest, the
+majority of frames decides. Moving objects therefore leave no trail.
 """
 
 import typing
@@ -25,7 +25,7 @@ from stereoweave.system.threads import thread_count
 MOST_FRAMES = 12.0
 """Maximum number of frames in a mean. The limit lets the mean follow slow changes."""
 SAME_PX, SAME_SHARE = 1.0, 0.02
-"""Two frames see the same surface if their disparities differ by at most SAME_PX + SAME_SHARE * disparity."""
+"""Two frames show one surface if their disparities differ by at most SAME_PX + SAME_SHARE * disparity."""
 NEIGHBOUR_PX = 3.0
 """Neighbours belong to the same surface if their disparities differ by less than this."""
 STEP_PX, STEPS = 8, 2
@@ -34,7 +34,7 @@ STEP_PX, STEPS = 8, 2
 # In pixels at half size, where noise is half as strong and optical flow takes a quarter of the time.
 _WINDOW_PX = 5
 # A window is explained if its mean difference is at most this multiple of the median difference, which
-# measures the noise of the image, plus an offset for clean images. The third number limits the noise.
+# measures the image noise, plus an offset for clean images. The third number is the highest noise assumed.
 _EXPLAINED, _LEAST_LEVELS, _NOISIEST_LEVELS = 1.5, 0.5, 6.0
 # Motion always explains a little more than rest, because it also fits the noise.
 _REST, _REST_LEVELS = 1.1, 0.25
@@ -48,7 +48,7 @@ _MEDIAN_ROUGHNESS = 6 * 0.674
 _CONTRAST, _CONTRAST_LEVELS = 2.0, 1.0
 # A window that differs by more than this share of its contrast shows something else, however faint.
 _DIFFERENT_SHARE = 0.6
-# In rendered videos, the previous frame explains over 0.4 of the windows with contrast, and less than 0.1 of
+# In rendered videos, the previous frame explains over 0.4 of the windows with contrast, but less than 0.1 of
 # them across a cut.
 _CUT_SHARE = 0.2
 # Contrast in less than this share of an image may be a single object that appears without a cut.
@@ -63,7 +63,8 @@ class Track(typing.NamedTuple):
     Attributes:
         disparity_px: Mean disparity over the frames.
         confidence: Mean confidence; a frame that contradicts the mean counts as 0.
-        frames: Number of frames in the mean, minus those that have contradicted it since; 0 where unknown.
+        frames: Number of frames in the mean, minus the number that contradicted the mean afterwards; 0 where
+            the disparity is unknown.
     """
 
     disparity_px: np.ndarray
@@ -113,7 +114,7 @@ class TemporalFilter:
         cuts: Number of cuts so far.
 
     Raises:
-        StereoweaveError: `threads` is below 1.
+        StereoweaveError: `threads` is out of range.
     """
 
     def __init__(self, threads: int | None = None) -> None:
@@ -137,8 +138,9 @@ class TemporalFilter:
         """
         if left.shape != right.shape or left.shape[:2] != estimate.disparity_px.shape:
             raise StereoweaveError(
-                f"estimate: expected the size of both images, found {list(estimate.disparity_px.shape)} for "
-                f"{list(left.shape[:2])} and {list(right.shape[:2])}; pass the estimate of this pair"
+                "estimate: expected the same size as both images, found "
+                f"{list(estimate.disparity_px.shape)} for images of {list(left.shape[:2])} and "
+                f"{list(right.shape[:2])}; pass the estimate of this pair"
             )
         before, self._greys = self._greys, [_convert_to_grey(left), _convert_to_grey(right)]
         # The right view has no confidence; the placeholder is not returned.
@@ -160,7 +162,7 @@ class TemporalFilter:
         )
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return the complete state as arrays for `np.savez`; a restored filter continues exactly."""
+        """Return the complete state as arrays for `np.savez`; a restored filter gives the same results."""
         kept = {"cuts": np.array(self.cuts)}
         for side, grey, track in zip(("left", "right"), self._greys, self._tracks, strict=False):
             kept[f"{side}_grey"] = grey
@@ -178,7 +180,7 @@ class TemporalFilter:
         return temporal_filter
 
     def _filter_tracks(self, before: list[np.ndarray], new_tracks: list[Track]) -> list[Track] | None:
-        """Return the new tracks filtered with the previous ones, or None after a cut."""
+        """Return the new tracks filtered with the previous tracks, or None after a cut."""
         if new_tracks[0].frames.shape != self._tracks[0].frames.shape:
             return None
         with ThreadPoolExecutor(self._threads) as pool:
@@ -200,7 +202,7 @@ def _convert_to_grey(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2
 
 
 def _measure_motion(before: UInt8[np.ndarray, "h2 w2"], grey: UInt8[np.ndarray, "h2 w2"]) -> Motion:
-    """Measure the motion from a grey image back to the previous one, both at half size."""
+    """Measure the motion from a grey image back to the previous image, both at half size."""
     before = _match_brightness(before, grey)
     rest = np.zeros((*grey.shape, 2), np.float32)
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST).calc(grey, before, rest)
@@ -242,7 +244,7 @@ def _estimate_noise_levels(grey: UInt8[np.ndarray, "h2 w2"]) -> float:
 def _match_brightness(
     before: UInt8[np.ndarray, "h2 w2"], grey: UInt8[np.ndarray, "h2 w2"]
 ) -> UInt8[np.ndarray, "h2 w2"]:
-    """Return the previous image with the mean and contrast of the new one.
+    """Return the previous image with the mean and contrast of the new image.
 
     Otherwise, a fade would count as a change of the scene.
     """
@@ -297,7 +299,7 @@ def _find_calm_matches(
 
 
 def _is_contradicted(new_tracks: list[Track], expected: list[Expectation]) -> bool:
-    """Return whether the new disparity contradicts most known pixels at rest. Only a sample is tested."""
+    """Return whether the new disparity contradicts most known pixels at rest, as tested on a sample."""
     asked, contradicted = [], []
     for new, (carried, calm, drift_px) in zip(new_tracks, expected, strict=True):
         new_px, old_px, frames = (
@@ -322,8 +324,8 @@ def _update(new: Track, expected: Expectation) -> Track:
 def carry(new_px, track, motion, carried):
     """Warp `track` to the new frame and write it to `carried`, with 0 frames where nothing is known.
 
-    Motion is not accurate to the pixel. Outside calm areas, each pixel therefore takes the value of one of
-    the nine pixels around its previous position: the one whose disparity is closest to new_px [H, W].
+    Motion is not accurate to the pixel. Outside calm areas, each pixel therefore takes its value from one of
+    the nine pixels around its previous position, the one whose disparity is closest to `new_px` [H, W].
     """
     old_px, old_confidence, old_frames = track.disparity_px, track.confidence, track.frames
     disparity_px, confidence, frames = carried.disparity_px, carried.confidence, carried.frames
@@ -339,8 +341,8 @@ def carry(new_px, track, motion, carried):
                 continue
             if not calm[i, j]:
                 middle_row, middle_column = row, column
-                # A neighbour must be clearly better than the centre: noise must not shift the map back
-                # and forth.
+                # A neighbour must be clearly better than the centre, so that noise does not shift the map
+                # back and forth.
                 least_px = abs(old_px[row, column] - new_px[y, x]) - 0.5
                 for near_row in range(max(middle_row - 1, 0), min(middle_row + 2, height)):
                     for near_column in range(max(middle_column - 1, 0), min(middle_column + 2, width)):
@@ -356,7 +358,7 @@ def carry(new_px, track, motion, carried):
 @kernel
 @typing.no_type_check
 def measure_drift(new_px, carried, drift_px):
-    """Write the disparity change of the surface around every second pixel to drift_px [H2, W2].
+    """Write the disparity change of the surface around every second pixel to `drift_px` [H2, W2].
 
     The result is the mean change in the neighbourhood, shrunk by the James-Stein estimator: the mean times
     1 - (standard error / mean) ** 2, or 0 where that factor is negative.

@@ -1,4 +1,4 @@
-"""Reading of one video file or series of pictures: the times of all frames, and the decodable frames."""
+"""Reading of a video file or a series of pictures: the times of all frames, and the decodable frames."""
 
 import re
 from array import array
@@ -40,7 +40,7 @@ _STEREO_3D = {
     7: "columns",
 }
 
-# The first box of an MP4 or MOV file, after four bytes of length.
+# Type of the first box in an MP4 or MOV file, which follows the four bytes of the box's length.
 _MP4_BOXES = b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot"
 
 # A file counts as cut off if it ends before its declared duration by more than this.
@@ -52,8 +52,8 @@ class Shot(NamedTuple):
 
     Attributes:
         number: Number of the frame in the track.
-        picture: Function that converts the frame to uint8 RGB [H, W, 3], so that only needed frames are
-            converted.
+        picture: Function that converts the frame to uint8 RGB [H, W, 3]. It is called only for needed
+            frames.
         is_key_frame: Whether the frame can be decoded without any earlier frame.
     """
 
@@ -68,13 +68,13 @@ class VideoTrack:
     Attributes:
         name: Path as given by the caller.
         steps: Display time of each frame, strictly increasing, in units of `time_base`.
-        retimed: Numbers of the frames that are shown later because their time stamp was missing or a
+        retimed: Numbers of the frames that are shown later because their timestamp was missing or a
             duplicate.
         time_base: Time unit in seconds.
         rate: Average frames per second.
         size_px: Width and height of a whole frame after the rotation that players apply.
-        declared_packing: Frame packing that the file declares: a full-size one in `PAIR_LAYOUTS`, or an
-            unsupported one; None if the file declares none.
+        declared_packing: Frame packing declared in the file, either a full-size packing in `PAIR_LAYOUTS` or
+            an unsupported packing; None if the file declares no packing.
         sound: Path of the file if it has sound, else None.
         truncation: Message about a file that ends early; None for a complete file.
 
@@ -99,8 +99,8 @@ class VideoTrack:
     def shots(self, start: int) -> Iterator[Shot]:
         """Yield the frames that can be decoded, in display order, always beginning with the first frame.
 
-        `start` is ignored so that all runs yield the same frames. The traces of a damaged frame in later
-        frames depend on every frame before it.
+        `start` is ignored so that all runs yield the same frames, because the artefacts that damage causes in
+        later frames depend on all frames before them.
         """
         with _opening(self._path) as (container, stream):
             frames = _decode(container, stream)
@@ -135,7 +135,7 @@ class VideoTrack:
         self.steps: Sequence[int] = range(len(stamps))
         self.time_base = 1 / rate
         self._stamps: Sequence[int] | None = None
-        # Raw streams and some AVI files have no time stamps. Their frames are timed by order and frame rate.
+        # Raw streams and some AVI files have no timestamps. Their frames are timed by order and frame rate.
         if 2 * len(set(stamps) - {None}) > len(stamps):
             self.time_base = Fraction(stream.time_base or 1)
             self._stamps = array("q", sorted(_fill_missing(stamps)))
@@ -168,7 +168,7 @@ class PictureTrack:
         self.size_px = first.shape[1], first.shape[0]
 
     def shots(self, start: int) -> Iterator[Shot]:
-        """Yield the readable pictures, beginning with the last one at or before `start`."""
+        """Yield the readable pictures, beginning with the last readable one at or before `start`."""
         before = next((index for index in range(start, 0, -1) if self._read_shot(index)), 0)
         yield from filter(None, map(self._read_shot, self.steps[before:]))
 
@@ -217,10 +217,12 @@ def open_track(path: Path, rate: Fraction | None) -> Track:
     files = list_picture_files(path)
     if files is None:
         if rate is not None:
-            raise StereoweaveError(f"{path}: expected pictures with a rate, found a video; omit the rate")
+            raise StereoweaveError(
+                f"{path}: expected pictures, because a rate is given, found a video; omit the rate"
+            )
         return VideoTrack(path)
     if not files:
-        raise FormatError(f"{path}: expected a video or pictures, found no pictures")
+        raise FormatError(f"{path}: expected at least one picture, found none")
     return PictureTrack(str(path), files, rate or Fraction(25))
 
 
@@ -267,7 +269,7 @@ def _decode(container: "av.container.InputContainer", stream: "av.VideoStream") 
                 packet.opaque = next(ranks)
             with suppress(av.error.FFmpegError):
                 yield from stream.decode(packet)
-    # If the file was read to its end, the decoder is already flushed and raises.
+    # If the file was read to its end, the decoder is already flushed and raises an error.
     with suppress(av.error.FFmpegError):
         yield from stream.decode(None)
 
@@ -275,7 +277,10 @@ def _decode(container: "av.container.InputContainer", stream: "av.VideoStream") 
 def _stamps(
     container: "av.container.InputContainer", stream: "av.VideoStream"
 ) -> tuple[list[int | None], Fraction, str | None]:
-    """Return all time stamps, the end of the last track in seconds, and the reason if reading ended early."""
+    """Return all timestamps of a stream, the latest end of any track, and the reason for an early stop.
+
+    The end is in seconds. The reason is None if the whole file could be read.
+    """
     import av
 
     stamps: list[int | None] = []
@@ -296,18 +301,18 @@ def _is_frame(packet: "av.Packet[Any]") -> bool:
 
 
 def _fill_missing(stamps: Sequence[int | None]) -> list[int]:
-    """Replace each missing time stamp with the last one before it in the file."""
+    """Replace each missing timestamp with the last known timestamp before it in the file."""
     known = next(stamp for stamp in stamps if stamp is not None)
     return [known := known if stamp is None else stamp for stamp in stamps]
 
 
 def _separate_duplicates(stamps: Sequence[int], frame_steps: int) -> tuple["array[int]", list[int]]:
-    """Make sorted time stamps strictly increasing by delaying duplicates.
+    """Make sorted timestamps strictly increasing by delaying duplicates.
 
-    A duplicate is delayed by one frame, or by half the time to the next frame if that is shorter.
+    A duplicate is delayed by the usual interval, or by half the time to the next frame if that is shorter.
 
     Args:
-        stamps: Sorted time stamps, in units of a time base.
+        stamps: Sorted timestamps, in units of a time base.
         frame_steps: Usual interval between frames, in the same units.
 
     Returns:
@@ -330,7 +335,7 @@ def _separate_duplicates(stamps: Sequence[int], frame_steps: int) -> tuple["arra
 def _number_by_stamp(
     frames: Iterator["av.VideoFrame"], stamps: Sequence[int]
 ) -> Iterator[tuple[int, "av.VideoFrame"]]:
-    """Yield each frame with its number, found by time stamp. Frames with equal stamps keep their order."""
+    """Yield each frame with its number, found by timestamp. Frames with equal timestamps keep their order."""
     last = -1
     for frame in frames:
         stamp = stamps[max(last, 0)] if frame.pts is None else frame.pts
@@ -360,7 +365,7 @@ def _drop_corrupt(frames: Iterator["av.VideoFrame"]) -> Iterator["av.VideoFrame"
 
 
 def _describe_unopened(path: Path, error: "av.error.FFmpegError") -> str:
-    """Return what was found instead of a video, for an error message."""
+    """Describe what was found instead of a video, for an error message."""
     beginning = b""
     with suppress(OSError), path.open("rb") as file:
         beginning = file.read(8)
@@ -384,7 +389,7 @@ def _convert_to_rgb(frame: "av.VideoFrame") -> UInt8[np.ndarray, "h w 3"]:
         format="rgb24",
         src_colorspace=(_BT709 if large else _BT601) if frame.colorspace in _UNTAGGED else None,
         dst_color_range=_FULL_RANGE,
-        # Without the last two flags, FFmpeg's fast path from 4:2:0 darkens by more than one level of 255.
+        # Without the last two flags, FFmpeg's fast path from 4:2:0 darkens images by over one level of 255.
         interpolation=Interpolation.BILINEAR | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT,
         threads=1,
     )
@@ -405,7 +410,7 @@ def _read_declared_packing(frame: "av.VideoFrame") -> str | None:
 
 
 def _choose_rate(steps: Sequence[int], time_base: Fraction, average: Fraction) -> Fraction:
-    """Return the frame rate of the container, or the measured one if the two differ by more than 1 %."""
+    """Return the container's frame rate, or the measured rate if the two differ by more than 1 %."""
     if len(steps) < 2:
         return average
     measured = Fraction(len(steps) - 1) / ((steps[-1] - steps[0]) * time_base)

@@ -1,7 +1,7 @@
 """Writing of the parts of a video, and joining of the parts with the sound.
 
-A part is a NUT file, which stores frame times exactly for any time base. Parts are joined packet by packet:
-nothing is encoded twice, and sound is copied bit for bit.
+A part is a NUT file, which stores frame times exactly for any time base. Parts are joined packet by packet,
+so nothing is encoded twice, and sound is copied bit for bit.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -42,7 +42,7 @@ CONTAINERS = {".mp4": "mp4", ".mkv": "matroska", ".mov": "mov"}
 _EXACT_TIMES = {"avoid_negative_ts": "disabled"}
 # Time scale of stream starts: a multiple of 90 kHz, 48 kHz and the numerators of rates such as 30000/1001.
 _EXACT_STARTS = {"movie_timescale": "720000"}
-# Enough to include the first packet of every audio stream.
+# Number of packets that includes the first packet of every audio stream.
 _TRIED_PACKETS = 64
 # swscale's default conversion darkens everything by a level or two.
 _EXACT_COLOURS = Interpolation.BICUBIC | Interpolation.ACCURATE_RND
@@ -70,7 +70,10 @@ GREY16 = Encoding("ffv1", "gray16le", ColorRange.JPEG, {"level": "3", "g": "1", 
 
 
 class Packing(NamedTuple):
-    """Frame packing: Matroska's stereo mode, and H.264's number, or None if that would swap the eyes."""
+    """Frame packing, as named by Matroska and as numbered by H.264.
+
+    The number is None if it would make players swap the eyes.
+    """
 
     stereo_mode: str
     frame_packing: int | None
@@ -110,14 +113,14 @@ class Recorder:
                 part.mux(stream.encode())
 
     def join(self, parts: Sequence[Path], sound: Path | None, out: Path, metadata: Mapping[str, str]) -> None:
-        """Join all parts with all audio streams of the file `sound`, copying every packet unchanged.
+        """Join all parts with all audio streams in the file `sound`, copying every packet unchanged.
 
-        MP4 and MOV store all times exactly; Matroska rounds to milliseconds.
+        MP4 and MOV store all times exactly; Matroska rounds them to milliseconds.
 
         Args:
             parts: Files written by `write_part`, in order.
             sound: Video whose sound and start time are copied; None for a silent video.
-            out: Output file; its ending must be in `CONTAINERS`.
+            out: Output file; its extension must be in `CONTAINERS`.
             metadata: Metadata of the output file.
         """
         with ExitStack() as stack:
@@ -141,7 +144,7 @@ class Recorder:
                 container.mux(packet)
 
     def _add_stream(self, part: OutputContainer, frame: VideoFrame) -> VideoStream:
-        """Add a video stream for frames of this size, with the colours of HD video (BT.709)."""
+        """Add a video stream for frames of this frame's size, with the colours of HD video (BT.709)."""
         options = dict(self.encoding.options)
         if self.packing and self.packing.frame_packing is not None:
             options["x264-params"] = f"frame-packing={self.packing.frame_packing}"
@@ -168,10 +171,10 @@ class Recorder:
 
 
 def check_container(path: Path, sound: Path | None) -> None:
-    """Raise StereoweaveError unless the ending of `path` selects a container that can hold the sound."""
+    """Raise StereoweaveError unless the extension of `path` selects a container that can hold the sound."""
     if path.suffix.lower() not in CONTAINERS:
         raise StereoweaveError(
-            f"{path}: expected a file name ending in {' or '.join(CONTAINERS)}, found {path.suffix!r}"
+            f"{path}: expected the file extension {' or '.join(CONTAINERS)}, found {path.suffix!r}"
         )
     if sound is None or _can_hold(path.suffix, sound):
         return
@@ -199,7 +202,7 @@ def _make_frame(picture: Picture) -> VideoFrame:
 
 
 def _can_hold(ending: str, sound: Path) -> bool:
-    """Return whether a container with this ending can hold the sound of a file, tested by muxing."""
+    """Return whether a container with this extension can hold a file's sound, as tested by muxing."""
     container = CONTAINERS[ending.lower()]
     try:
         with av.open(str(sound)) as source, av.open(BytesIO(), "w", format=container) as output:
@@ -210,7 +213,7 @@ def _can_hold(ending: str, sound: Path) -> bool:
 
 
 def _copy_sound_streams(source: InputContainer, output: OutputContainer) -> dict[int, AudioStream]:
-    """Add each audio stream of the source to the output. Return the new streams by source index."""
+    """Add each audio stream in the source to the output, and return the new streams by source index."""
     streams = {}
     for stream in source.streams.audio:
         streams[stream.index] = copy = output.add_stream_from_template(stream, opaque=True)
@@ -233,7 +236,7 @@ def _find_start_s(stream: Stream | None) -> Fraction:
 
 
 def _drop_empty(packets: Iterable[AnyPacket]) -> Iterator[AnyPacket]:
-    """Yield the packets except the empty ones that a demuxer emits at the end."""
+    """Yield all packets except the empty packets that a demuxer emits at the end."""
     return (packet for packet in packets if packet.size)
 
 

@@ -24,7 +24,7 @@ from stereoweave.io.images import read_image, write_image
 pytestmark = pytest.mark.system
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
-REFUSED = (403, "expected a file that you uploaded or that this page made for you; upload the pictures again")
+REFUSED = (403, "access is limited to your uploads and the files made from them; upload the pictures again")
 
 
 @pytest.fixture(scope="module")

@@ -137,7 +137,7 @@ def test_a_series_of_pictures_is_a_video(tmp_path):
     ],
 )
 def test_an_invalid_source_is_named_with_what_was_expected(source, found):
-    with pytest.raises(FormatError, match=rf"^{re.escape(source)}: expected the number of a camera.*{found}"):
+    with pytest.raises(FormatError, match=rf"^{re.escape(source)}: expected a camera number.*{found}"):
         Capture([source])
 
 

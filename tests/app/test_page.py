@@ -273,7 +273,8 @@ def test_an_expired_upload_is_requested_again(tmp_path):
     )
     with pytest.raises(
         StereoweaveError,
-        match=r"^calib.txt: expected an upload from the last hour, found an expired one; upload it again$",
+        match=r"^calib.txt: expected an upload from the last hour, found an expired one; upload the file "
+        r"again$",
     ):
         match_uploads(uploads, tmp_path, lambda share, what: None)
 

@@ -241,7 +241,7 @@ def test_the_run_fails_if_child_processes_are_killed_while_they_start(stores_and
     source, out, chunk = stores_and_chunk
     out.write_bytes(f"begun/{chunk:08d}.json", b"{}")
     with pytest.raises(
-        StereoweaveError, match="was killed 2 times in a row while it loaded the network; did it run out"
+        StereoweaveError, match="was killed 2 times in a row while loading the network; did it run out"
     ):
         KilledAtStart(source, out, JOB)([chunk])
 
@@ -331,8 +331,8 @@ def test_a_store_error_keeps_its_setting_and_remedy(stores_and_chunk, monkeypatc
     with pytest.raises(StereoweaveError) as caught:
         _check_folders(ChunkWorker(source, out, JOB))
     assert caught.value.format(str.upper) == (
-        f"SOURCE: {platform.node()}: expected a store, found none; put it on a disk that all machines of the "
-        "cluster share, or use an object store; mount it (WORKERS)"
+        f"SOURCE: {platform.node()}: expected a store, found none; put the folder on a disk that all "
+        "machines in the cluster share, or use an object store; mount it (WORKERS)"
     )
 
 
@@ -419,7 +419,7 @@ def test_another_runs_destination_and_an_empty_source_are_refused(engine, tmp_pa
     with pytest.raises(StereoweaveError, match="none: expected a folder, found no such folder"):
         run_cluster(tmp_path / "none", tmp_path / "new", JOB, engine)
     (tmp_path / "empty").mkdir()
-    with pytest.raises(StereoweaveError, match="expected pairs of pictures or videos, found none"):
+    with pytest.raises(StereoweaveError, match="expected videos or pairs of pictures, found none"):
         run_cluster(tmp_path / "empty", tmp_path / "new", JOB, engine)
 
 

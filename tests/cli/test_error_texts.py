@@ -52,7 +52,9 @@ ERRORS = {
     "--list)",
     "depth --left none*.png --right right*.png -o out": "--left: expected pictures that match none*.png, "
     "found none; check and quote the pattern",
-    "batch . out --gpus-each 1.5": "--gpus-each: expected 0, a fraction of 1 or a whole number, found 1.5",
+    "batch . out --gpus-each 1.5": (
+        "--gpus-each: expected 0, a fraction below 1, or a whole number, found 1.5"
+    ),
     f"view {PAIR} --position 3 -o out.png": (
         "--position: expected -1 to 2 (0 is the left camera and 1 the right one), got 3"
     ),

@@ -22,7 +22,7 @@ def test_a_job_that_alone_takes_longer_than_the_remaining_time_is_refused():
 def test_a_job_that_would_be_late_after_pending_jobs_may_be_retried_when_they_are_done():
     budget = Budget(seconds_each=2)
     with budget.admit(job(), megapixels=2, left_s=5), budget.admit(job(), megapixels=0.5, left_s=5):
-        with pytest.raises(BusyError, match="make this one 2 s late") as busy:
+        with pytest.raises(BusyError, match="make this request 2 s late") as busy:
             budget.admit(job(), megapixels=0.8, left_s=5).__enter__()
         assert busy.value.retry_after_s == 2  # 4 + 1 + 1.6 - 5, rounded up
     with budget.admit(job(), megapixels=2, left_s=5):
@@ -42,7 +42,7 @@ def test_pending_jobs_are_expected_to_run_at_the_usual_speed():
     for took_s in (30, 30, 500):
         budget.learn(work=10, took_s=took_s)
     with budget.admit(job(), megapixels=1, left_s=6):
-        with pytest.raises(BusyError, match="make this one 3 s late"):
+        with pytest.raises(BusyError, match="make this request 3 s late"):
             budget.admit(job(), megapixels=2, left_s=6).__enter__()
         with budget.admit(job(), megapixels=1, left_s=6):
             pass

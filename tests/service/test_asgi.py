@@ -79,7 +79,7 @@ def test_a_request_that_does_not_arrive_in_time_is_refused():
 
     response = ask_guard(wait_forever, stalls())
     assert response.status_code == 408
-    assert "found part of it" in response.json()["detail"]
+    assert "found only part of it" in response.json()["detail"]
 
 
 def test_no_more_requests_are_accepted_at_once_than_the_limit_of_pending_ones():
@@ -238,7 +238,7 @@ def test_a_full_disk_or_memory_is_a_server_error(error, found):
     response = ask_guard(fails, timeout_s=60)
     assert response.status_code == 503
     detail = response.json()["detail"]
-    assert detail.startswith("expected room for the request on disk and in memory, found ")
+    assert detail.startswith("the service could not store or process the request (")
     assert found in detail
     assert "\n" not in detail
 

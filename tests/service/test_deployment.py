@@ -250,7 +250,7 @@ def test_removed_temporary_folders_are_made_again_and_a_failure_to_make_one_is_r
     measuring.touch()
     refused = post(running.client, "/disparity")
     assert refused.status_code == 503
-    assert refused.json()["detail"].startswith("expected room for the request on disk and in memory, found ")
+    assert refused.json()["detail"].startswith("the service could not store or process the request (")
     measuring.unlink()
     assert post(running.client, "/disparity").status_code == 200
 
@@ -359,8 +359,8 @@ def test_a_cluster_without_room_is_reported_at_once(ray_address, capsys):
     assert main(["serve", "--port", "0", "--address", ray_address, "--threads", "3"]) == 2
     printed = capsys.readouterr().err
     assert printed == (
-        "stereoweave: --replicas: expected at most 0, as each takes 3 cores, found 1; "
-        "ask for less (--replicas, --threads)\n"
+        "stereoweave: --replicas: expected at most 0, because each takes 3 cores, found 1; "
+        "use lower values (--replicas, --threads)\n"
     )
 
 
@@ -370,7 +370,7 @@ def test_a_network_missing_on_the_cluster_is_named(ray_address, capsys):
     printed = capsys.readouterr().err
     assert (
         "a replica could not load the network: none.onnx: expected an ONNX matcher file, found no such file; "
-        "is the model on every machine of the service?" in printed
+        "is the model available on every machine of the service?" in printed
     )
     assert printed.count("\n") == 1
 

@@ -60,7 +60,7 @@ def test_a_call_that_takes_too_long_ends_its_process_and_the_next_call_succeeds(
 
 def test_a_crash_is_reported_in_one_line_and_the_next_call_succeeds(tmp_path):
     child = child_of(signal.raise_signal, tmp_path / "files")
-    with pytest.raises(ProcessDiedError, match=r"ended early \(SIGSEGV\): ") as crash:
+    with pytest.raises(ProcessDiedError, match=r"exited early \(SIGSEGV\); ") as crash:
         child(signal.SIGSEGV, timeout_s=10)
     assert "\n" not in str(crash.value)
     assert child(0, timeout_s=10) is None  # signal 0 has no effect

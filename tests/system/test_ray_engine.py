@@ -139,7 +139,7 @@ def test_a_worker_too_large_for_every_machine_is_refused_and_fractions_of_cores_
         list(stream(make_reporter, [1], Engine(cpus_each=3)))
     with pytest.raises(
         StereoweaveError,
-        match=r"a machine with 1 cores and 0.5 GPUs .* found 2 and 0 .*; or ask for less "
+        match=r"a machine with 1 cores and 0.5 GPUs .* found 2 and 0 .*; or use lower values "
         r"\(cpus_each, gpus_each\)$",
     ):
         count_slots(Engine(gpus_each=0.5))
@@ -170,10 +170,11 @@ def test_a_wrong_address_is_reported_in_one_line(engine, monkeypatch):
     ray.shutdown()  # with an existing connection, the address would not be used
     monkeypatch.setattr(engine_module, "_STATUS_TIMEOUT_S", 1)
     with socket.create_server(("127.0.0.1", 0)) as deaf:
+        no_reply = r"expected the head of a Ray cluster, found none \(no reply in 1 s\)"
         addresses = {
             "127.0.0.1:1": "^127.0.0.1:1: expected the head of a Ray cluster, found .*refused",
             "ray://127.0.0.1:1": "expected the head of a Ray cluster, found .*refused",
-            f"127.0.0.1:{deaf.getsockname()[1]}": "expected the head of a Ray cluster, found no reply in 1 s",
+            f"127.0.0.1:{deaf.getsockname()[1]}": no_reply,
             "nonsense": "expected host:port, ray://host:port, auto or local, found 'nonsense'",
         }
         for address, expected in addresses.items():

@@ -161,7 +161,7 @@ def test_depth_in_16_bits_warns_of_disparities_outside_its_range(tmp_path, capsy
     video = write_side_by_side(tmp_path / "in.mp4", converged_pairs([40, 40]), codec="libx264")
     assert run(video, tmp_path / "out.mkv", "--depth16", "--format", "side_by_side") == 0
     [line] = [line for line in capsys.readouterr().err.splitlines() if "16-bit" in line]
-    assert line.startswith("16-bit grey covers 0 to 255.99 px; this video's disparities of -2")
+    assert line.startswith("16-bit grey covers 0 to 255.99 px; this video's disparities from -2")
     assert line.endswith("are clipped; show all of them in colours (--depth)")
 
 
@@ -231,8 +231,8 @@ def test_parts_made_with_other_settings_are_not_resumed(tmp_path, monkeypatch, c
     assert run(video, tmp_path / "out.mp4", "--position", "0.6") == 2
     folder = tmp_path / "out.mp4.parts"
     assert capsys.readouterr().err == (
-        f"stereoweave: {folder}: expected parts of the same video, found parts made with --position 0.4, "
-        "with --convergence 3.0; remove this folder, or rerun with the same settings\n"
+        f"stereoweave: {folder}: expected parts made with the current settings, found parts made with "
+        "--position 0.4, with --convergence 3.0; remove this folder, or rerun with the same settings\n"
     )
 
 
@@ -281,9 +281,9 @@ def test_a_damaged_frame_is_reported_with_its_time_and_does_not_end_the_video(tm
         ("out.mp4", ["--layout", "wiggle"], "--layout: expected one of side_by_side, "),
         ("out.mp4", ["--position", "2.5"], "--position: expected -1 to 2"),
         ("out.mp4", ["--position", "1", "--strength", "4"], "position 1 at strength 4"),
-        ("out.gif", ["--depth"], "expected a file name ending in .mp4 or .mkv or .mov, found '.gif'"),
-        ("out.mp4", ["--depth16"], "expected a file name ending in .mkv for 16-bit depth, found '.mp4'"),
-        ("in.mp4", ["--depth"], "expected an output other than the input, found the same file"),
+        ("out.gif", ["--depth"], "expected the file extension .mp4 or .mkv or .mov, found '.gif'"),
+        ("out.mp4", ["--depth16"], "expected the file extension .mkv for 16-bit depth, found '.mp4'"),
+        ("in.mp4", ["--depth"], "expected an output file other than the input, found the same file"),
         ("out.mp4", ["--depth", "--model", "huge"], "unknown model 'huge'"),
         ("out.mp4", ["--depth", "--format", "diagonal"], "--format: expected one of side_by_side"),
         ("out.mp4", ["--position", "0", "--convergence", "nan"], "--convergence: expected a finite number"),
@@ -292,7 +292,7 @@ def test_a_damaged_frame_is_reported_with_its_time_and_does_not_end_the_video(tm
         ("out.mp4", ["--depth", "--convergence", "3"], "--convergence: expected a view or a layout of views"),
         ("out.mkv", ["--depth16", "--strength", "2"], "as output, found depth16"),
         ("out.mp4", ["--layout", "rgbd", "--convergence", "0"], "as output, found layout rgbd"),
-        ("out.mp4", ["--depth", "--rate", "24"], "expected pictures with a rate, found a video"),
+        ("out.mp4", ["--depth", "--rate", "24"], "expected pictures, because a rate is given, found a video"),
         ("out.mp4", ["--depth", "--rate", "1/0"], "--rate: expected frames per second"),
         ("out.mp4", ["--depth", "--rate", "-5"], "--rate: expected frames per second"),
         ("out.mp4", ["--depth", "--rate", "1e300"], "at most 1000, found '1e300'"),

@@ -263,7 +263,7 @@ def test_frames_without_time_stamps_are_timed_by_the_frame_rate(tmp_path):
         assert [frame.time for frame in frames] == [Fraction(index, 25) for index in range(9)]
 
 
-MOVED = "its time stamp was missing or a duplicate, so it is shown slightly later"
+MOVED = "its timestamp was missing or a duplicate, so it is shown slightly later"
 
 
 def restamped(path, stamps_ms):

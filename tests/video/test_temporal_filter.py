@@ -328,7 +328,8 @@ def test_odd_image_sizes_are_filtered(rng, height, width):
 
 
 def test_an_estimate_of_another_size_is_refused(rng, without_shape_checks):
-    with pytest.raises(StereoweaveError, match="estimate: expected the size of both images, found .90, 91."):
+    expected = "estimate: expected the same size as both images, found .90, 91."
+    with pytest.raises(StereoweaveError, match=expected):
         TemporalFilter()(texture(rng), texture(rng), estimate(np.ones((90, 91))))
 
 
