@@ -387,7 +387,7 @@ def _make_refusal(status: int, detail: str, headers: Mapping[str, str] | None = 
 
 
 def _refuse_token() -> Response:
-    detail = "expected the header Authorization: Bearer with this service's token, found no or a wrong token"
+    detail = "expected the header Authorization: Bearer with this service's token, found no valid token"
     return _make_refusal(401, detail, {"WWW-Authenticate": "Bearer"})
 
 

@@ -122,8 +122,8 @@ class VideoJob:
         if not self.depth16 or (low_px >= 0 and high_px <= _MOST_GREY16_PX):
             return []
         text = (
-            f"16-bit grey covers 0 to {_MOST_GREY16_PX} px; this video's disparities from {low_px:.1f} to "
-            f"{high_px:.1f} px are clipped"
+            f"16-bit grey covers 0 to {_MOST_GREY16_PX} px; this video's disparities range from "
+            f"{low_px:.1f} to {high_px:.1f} px, so some are clipped"
         )
         return [Note(text, Remedy("show all of them in colours", ("depth",)))]
 

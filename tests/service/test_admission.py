@@ -60,7 +60,7 @@ def test_an_unfinished_job_slows_the_usual_speed_but_leaves_the_best_speed_uncha
     budget = Budget(seconds_each=2)
     budget.learn(work=1, took_s=8, finished=False)
     budget.learn(work=8, took_s=1, finished=False)  # stopped early, so it counts as the median, 5
-    with budget.admit(job(), megapixels=1, left_s=2), pytest.raises(BusyError, match="one 1 s late"):
+    with budget.admit(job(), megapixels=1, left_s=2), pytest.raises(BusyError, match="request 1 s late"):
         budget.admit(job(), megapixels=1, left_s=9).__enter__()  # twice the median of 2, 5 and 8, minus 9
     with pytest.raises(TooLargeError, match="take 2 s"):
         budget.admit(job(), megapixels=1, left_s=1.9).__enter__()

@@ -161,7 +161,7 @@ def test_depth_in_16_bits_warns_of_disparities_outside_its_range(tmp_path, capsy
     video = write_side_by_side(tmp_path / "in.mp4", converged_pairs([40, 40]), codec="libx264")
     assert run(video, tmp_path / "out.mkv", "--depth16", "--format", "side_by_side") == 0
     [line] = [line for line in capsys.readouterr().err.splitlines() if "16-bit" in line]
-    assert line.startswith("16-bit grey covers 0 to 255.99 px; this video's disparities from -2")
+    assert line.startswith("16-bit grey covers 0 to 255.99 px; this video's disparities range from -2")
     assert line.endswith("are clipped; show all of them in colours (--depth)")
 
 
