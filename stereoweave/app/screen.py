@@ -50,7 +50,7 @@ class Screen(ThreadingHTTPServer):
             super().__init__((_ADDRESS, port), _Handler)
         except OSError as error:
             raise StereoweaveError(
-                f"port {port} cannot be opened ({error.strerror}); use 0 for any free port",
+                f"expected an available port, found {port} ({error.strerror}); use 0 for any free port",
                 setting="port",
             ) from error
         self.url = f"http://{_ADDRESS}:{self.server_port}/"
