@@ -1,0 +1,86 @@
+"""Scores of rectification on hand-held-like pairs."""
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from experiments.handheld.pairs import HandheldPair, make_handheld_pairs
+from stereoweave.cameras.picture_warp import PictureWarp
+from stereoweave.cameras.rectify_uncalibrated import fit_warps
+from stereoweave.errors import StereoweaveError
+
+_LOST_STEP_PX = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class HandheldRow:
+    """Score of one pair.
+
+    Attributes:
+        pair: Name of the original, and number of the pair.
+        width_px, height_px: Size of the pictures.
+        before_px: Median vertical error at the true correspondences before rectification.
+        median_px, px95: Median and 95th percentile of the vertical error afterwards; NaN if refused.
+        lost_percent: Percentage of the left picture that is outside the rectified one.
+        seconds: Time of the fit.
+        refused: Why the pair was refused; empty if it was not.
+    """
+
+    pair: str
+    width_px: int
+    height_px: int
+    before_px: float
+    median_px: float = float("nan")
+    px95: float = float("nan")
+    lost_percent: float = float("nan")
+    seconds: float = float("nan")
+    refused: str = ""
+
+
+def score_handheld_pairs(real: Path) -> list[HandheldRow]:
+    """Rectify the hand-held-like pairs, and measure them at their true correspondences."""
+    return [score(made) for made in make_handheld_pairs(real)]
+
+
+def score(made: HandheldPair) -> HandheldRow:
+    """Rectify one pair, and measure it at its true correspondences."""
+    height, width = made.pair.left.shape[:2]
+    before_px = float(np.median(np.abs(made.left_px - made.right_px)[:, 1]))
+    start_s = time.perf_counter()
+    try:
+        warps, _ = fit_warps(made.pair)
+    except StereoweaveError as error:
+        return HandheldRow(
+            pair=made.name, width_px=width, height_px=height, before_px=before_px, refused=str(error)
+        )
+    seconds = time.perf_counter() - start_s
+    off_px = np.abs(warps.left.transform(made.left_px) - warps.right.transform(made.right_px))[:, 1]
+    return HandheldRow(
+        pair=made.name,
+        width_px=width,
+        height_px=height,
+        before_px=before_px,
+        median_px=float(np.median(off_px)),
+        px95=float(np.percentile(off_px, 95)),
+        lost_percent=_measure_lost_percent(warps.left),
+        seconds=seconds,
+    )
+
+
+def summarize(rows: list[HandheldRow]) -> str:
+    """Return how many pairs end under 0.5 px, and how many of these keep 90 % of the left picture."""
+    good = [row for row in rows if row.median_px < 0.5]
+    kept = sum(row.lost_percent <= 10 for row in good)
+    return f"{len(good)} of {len(rows)} pairs end under 0.5 px, and {kept} of these lose at most 10 %"
+
+
+def _measure_lost_percent(warp: PictureWarp) -> float:
+    width, height = warp.size_px
+    rows, columns = np.mgrid[:height:_LOST_STEP_PX, :width:_LOST_STEP_PX]
+    places_px: Float[np.ndarray, "n 2"] = np.column_stack([columns.ravel(), rows.ravel()]).astype(float)
+    moved_px = warp.transform(places_px)
+    outside = (moved_px < 0) | (moved_px > np.array(warp.size_px) - 1)
+    return 100 * float(outside.any(1).mean())
