@@ -50,9 +50,9 @@ class Warps(NamedTuple):
 def rectify_by_features(pair: StereoPair) -> Rectified:
     """Rectify a pair using its feature matches.
 
-    Both pictures are warped by the smallest camera rotations that suffice; the focal length is fitted too.
-    Unlike arbitrary homographies, rotations preserve shapes. The result has no camera, because neither focal
-    length nor baseline is known well enough for metric depth.
+    Both pictures are warped by the smallest camera rotations that suffice. The focal length, the difference
+    in scale and the lens distortion are fitted too. Unlike arbitrary homographies, rotations preserve shapes.
+    The result has no camera, because neither focal length nor baseline is known well enough for metric depth.
 
     Source: "Quasi-Euclidean epipolar rectification of uncalibrated images" (Fusiello and Irsara 2011).
 
@@ -74,20 +74,20 @@ def fit_warps(pair: StereoPair) -> tuple[Warps, Note]:
     for _ in range(_SELECTIONS):
         parameters = _fit_cameras(matches, (width, height))
         warps = _make_warps(parameters, (width, height))
-        matches = _keep(found, np.abs(_measure_sampson_px(warps, found)) < _RIGHT_PX)
+        matches = _require_enough(found, np.abs(_measure_sampson_px(warps, found)) < _RIGHT_PX)
     missed_px = np.abs(warps.measure_lower_px(matches))
     _check(parameters, float(np.median(missed_px)), width, height)
     warps, moved_px = _align_views(warps, matches)
     note = Note(
-        f"rectified by {len(missed_px)} matches: median vertical error {np.median(missed_px):.2f} px, before "
-        f"{np.median(np.abs(matches.lower_px)):.2f} px; the right picture was scaled by "
+        f"rectified with {len(missed_px)} matches: median vertical error {np.median(missed_px):.2f} px "
+        f"({np.median(np.abs(matches.lower_px)):.2f} px before); the right picture was scaled by "
         f"{100 * np.expm1(-parameters[_LOG_SCALE]):+.1f} % and shifted sideways by {moved_px:+.0f} px"
     )
     return warps, note
 
 
 def _select_inliers(found: Matches) -> Matches:
-    """Return the matches that agree with one epipolar geometry."""
+    """Return the matches that are consistent with the same epipolar geometry."""
     count = len(found.left_px)
     right_ones = np.zeros(count, bool)
     if count >= _LEAST_MATCHES:
@@ -97,18 +97,21 @@ def _select_inliers(found: Matches) -> Matches:
                 found.left_px, found.right_px, cv2.USAC_MAGSAC, _RIGHT_PX, 0.9999, 5000
             )
             right_ones = right_ones if mask is None else mask.ravel() > 0
+    return _require_enough(found, right_ones)
+
+
+def _require_enough(found: Matches, right_ones: Bool[np.ndarray, " n"]) -> Matches:
+    """Return the matches that agree; raise a StereoweaveError if there are too few."""
+    count = len(right_ones)
     if right_ones.sum() < max(_LEAST_MATCHES, _LEAST_RIGHT_SHARE * count):
         raise StereoweaveError(
             f"expected at least {_LEAST_MATCHES} feature matches that agree on the camera positions, "
-            f"found {right_ones.sum()} of {count} matches; take pictures with more texture and more overlap",
+            f"found {right_ones.sum()} of {count} matches; "
+            "photograph a scene with more texture and with more overlap",
             setting="rectify",
             remedy=Remedy("or give a calibration", ("calibration",)),
         )
-    return _keep(found, right_ones)
-
-
-def _keep(matches: Matches, chosen: Bool[np.ndarray, " n"]) -> Matches:
-    return Matches(matches.left_px[chosen], matches.right_px[chosen])
+    return Matches(found.left_px[right_ones], found.right_px[right_ones])
 
 
 def _fit_cameras(matches: Matches, size_px: tuple[int, int]) -> Float[np.ndarray, " 8"]:
