@@ -295,7 +295,7 @@ def test_a_damaged_frame_is_reported_with_its_time_and_does_not_end_the_video(tm
         ("out.mp4", ["--depth", "--rate", "24"], "expected pictures, because a rate is given, found a video"),
         ("out.mp4", ["--depth", "--rate", "1/0"], "--rate: expected frames per second"),
         ("out.mp4", ["--depth", "--rate", "-5"], "--rate: expected frames per second"),
-        ("out.mp4", ["--depth", "--rate", "1e300"], "at most 1000, found '1e300'"),
+        ("out.mp4", ["--depth", "--rate", "1e300"], "at most 1000, such as 24 or 30000/1001, found '1e300'"),
         ("out.mp4", ["--depth", "--rate", ""], "--rate: expected frames per second"),
     ],
 )

@@ -164,7 +164,7 @@ def test_a_layer_of_another_shape_is_refused_with_both_shapes(tmp_path):
 
 def test_a_file_that_is_no_state_of_a_network_is_refused(tmp_path):
     assert "found a list" in refused(saved(tmp_path, [1, 2]))
-    assert "found nothing" in refused(saved(tmp_path, {"features.0.weight": "text"}))
+    assert "found none" in refused(saved(tmp_path, {"features.0.weight": "text"}))
 
 
 def test_a_file_of_other_bytes_is_refused(tmp_path):
