@@ -19,7 +19,7 @@ Seeds = Annotated[
 
 
 def run(command: Callable[..., None], module: str, arguments: Sequence[str] | None) -> int:
-    """Run an experiment's only command, `python -m MODULE`. Returns its exit code; see `root.run`."""
+    """Run an experiment's only command, `python -m MODULE`, and return its exit code; see `root.run`."""
     app = Commands()
     app.command()(command)
     return root.run(app, f"python -m {module}", arguments)

@@ -1,4 +1,4 @@
-"""Description of one training of an experiment."""
+"""Description of one training run of an experiment."""
 
 from dataclasses import dataclass
 
@@ -7,12 +7,12 @@ from stereoweave.learn.recipe import Recipe
 
 @dataclass(frozen=True, kw_only=True)
 class Trial:
-    """One training of an experiment.
+    """One training run of an experiment.
 
     Attributes:
-        claim: Claim or design choice that the training tests.
-        setting: Name of the training, unique within its claim.
-        recipe: Everything that the training depends on.
+        claim: Claim or design choice that the run tests.
+        setting: Name of the tested setting; runs that differ only in their seeds share it.
+        recipe: Everything that the run depends on.
     """
 
     claim: str

@@ -1,7 +1,7 @@
 """Errors and notes, with their remedies.
 
-A remedy names settings by their Python keywords, which each front end translates into its own names: those of
-options, form fields or labels.
+A remedy names settings by their Python keywords. Each front end translates the keywords into the names of its
+own options, form fields or labels.
 """
 
 import copy
@@ -127,7 +127,7 @@ def _with_remedy(text: str, remedy: Remedy | None, name_of: NameOf) -> str:
 def require_extra(extra: str, what: str) -> Iterator[None]:
     """Turn a missing library's import error into a StereoweaveError that names the extra to install.
 
-    `what` begins the message, for example with "a plot needs matplotlib".
+    `what` is the beginning of the message, such as "a plot needs matplotlib".
     """
     try:
         yield
@@ -139,7 +139,7 @@ def require_extra(extra: str, what: str) -> Iterator[None]:
 
 
 def reason(error: Exception) -> str:
-    """Return what was found instead of a usable file, to complete "expected ..., found ..."."""
+    """Describe what was found instead of a usable file, to complete "expected ..., found ..."."""
     match error:
         case FileNotFoundError():
             return "no such file"

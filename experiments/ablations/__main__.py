@@ -41,7 +41,7 @@ def ablations(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line. Returns its exit code."""
+    """Run the command line, and return its exit code."""
     return run(ablations, "experiments.ablations", arguments)
 
 

@@ -76,19 +76,19 @@ def plan(base: Recipe, seeds: int) -> list[Trial]:
 def run_ablations(
     planned: Sequence[Trial], runs: Path, rendered: Path, report: Path, console: Console
 ) -> None:
-    """Train each variation in its own folder, and rewrite the report after each training.
+    """Train each variation in its own folder, and rewrite the report after each training run.
 
     Rows of the report with the same recipe are reused; other rows are dropped.
 
     Args:
-        planned: Trainings to run.
-        runs: Folder of the runs, with cached pairs in `pairs`.
+        planned: Trials to train.
+        runs: Folder of the runs, with cached pairs in the subfolder `pairs`.
         rendered: Set of held-out rendered pairs, scored in addition to the held-out collages.
         report: CSV file to write.
         console: Console that shows the progress.
 
     Raises:
-        StereoweaveError: If training or held-out pairs are missing, before the first training.
+        StereoweaveError: If training or held-out pairs are missing; raised before training starts.
     """
     register_variants()
     rendered_pairs = RenderedSet(Shards(rendered))

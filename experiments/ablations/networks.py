@@ -41,7 +41,7 @@ def soft_argmax(logits: Float[Tensor, "b d h w"]) -> Float[Tensor, "b 1 h w"]:
 
 
 class BilinearWeaveNet(WeaveNet):
-    """WeaveNet with bilinear upsampling, without weights from the image."""
+    """WeaveNet with bilinear upsampling instead of weights from the image."""
 
     upsample = staticmethod(upsample_bilinear)
 

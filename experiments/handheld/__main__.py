@@ -43,7 +43,7 @@ def handheld(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line. Returns its exit code."""
+    """Run the command line, and return its exit code."""
     return run(handheld, "experiments.handheld", arguments)
 
 

@@ -20,7 +20,7 @@ class Size(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Ranges:
-    """Ranges of the random parameters, drawn uniformly; each range is symmetric unless stated otherwise.
+    """Ranges of the uniformly drawn random parameters; symmetric about zero unless stated otherwise.
 
     Attributes:
         turn_degrees: Rotation of each camera about each of its axes, relative to the rectified pair. A

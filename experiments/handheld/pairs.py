@@ -147,7 +147,7 @@ def _take(
 def _find_correspondences(
     cameras: tuple[HandheldCamera, HandheldCamera], truth_px: Float32[np.ndarray, "h w"], size: Size
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
-    """Return the places at which both hand-held pictures show the same points, visible to both cameras."""
+    """Return the places at which the two hand-held pictures show the points that both cameras see."""
     original = Size(truth_px.shape[1], truth_px.shape[0])
     rows, columns = np.nonzero(_find_visible(truth_px))
     on_grid = (rows % _GRID_PX == 0) & (columns % _GRID_PX == 0)

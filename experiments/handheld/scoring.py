@@ -1,4 +1,4 @@
-"""Scores of rectification on hand-held-like pairs."""
+"""Scores of rectification on simulated hand-held pairs."""
 
 import time
 from dataclasses import dataclass
@@ -41,12 +41,12 @@ class HandheldRow:
 
 
 def score_handheld_pairs(real: Path) -> list[HandheldRow]:
-    """Rectify the hand-held-like pairs, and measure them at their true correspondences."""
+    """Rectify the simulated hand-held pairs, and measure their errors at the true correspondences."""
     return [score(made) for made in make_handheld_pairs(real)]
 
 
 def score(made: HandheldPair) -> HandheldRow:
-    """Rectify one pair, and measure it at its true correspondences."""
+    """Rectify one pair, and measure its errors at the true correspondences."""
     height, width = made.pair.left.shape[:2]
     before_px = float(np.median(np.abs(made.left_px - made.right_px)[:, 1]))
     start_s = time.perf_counter()
@@ -71,7 +71,7 @@ def score(made: HandheldPair) -> HandheldRow:
 
 
 def summarize(rows: list[HandheldRow]) -> str:
-    """Return how many pairs end under 0.5 px, and how many of these keep 90 % of the left picture."""
+    """Describe how many pairs end below 0.5 px, and how many of these keep 90 % of the left picture."""
     good = [row for row in rows if row.median_px < 0.5]
     kept = sum(row.lost_percent <= 10 for row in good)
     return f"{len(good)} of {len(rows)} pairs end under 0.5 px, and {kept} of these lose at most 10 %"

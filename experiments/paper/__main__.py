@@ -41,7 +41,7 @@ def paper(  # noqa: PLR0913 - each is an option of the command line
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line. Returns its exit code."""
+    """Run the command line, and return its exit code."""
     return run(paper, "experiments.paper", arguments)
 
 

@@ -11,16 +11,16 @@ from experiments.paper.trials import ADJUSTMENT, DECODER, NETWORKS, NETWORKS_SHO
 
 @dataclass(frozen=True, kw_only=True)
 class PaperRow:
-    """Scores of one training of the experiment on the held-out pairs.
+    """Scores of one training run on the held-out pairs.
 
     Attributes:
-        claim, setting: Purpose of the training. A training that serves several claims has a row for each.
+        claim, setting: Purpose of the run. A run that serves several claims has a row for each.
         seed: Seed of the initial weights, the training pairs and their order.
-        steps: Steps of the training; it has seen steps * batch pairs.
-        prediction: Loss between codes that the network was trained with.
-        squared_error: Squared error between codes without exponent; comparable between exponents.
+        steps: Number of training steps; the network has seen steps * batch pairs.
+        prediction: Loss between codes, of the kind that was minimised in training.
+        squared_error: Squared error between codes without the exponent, comparable across exponents.
         epe_px, epe_cm, mae_sourced, sourced_percent, mae_filled, psnr_db, ssim: See `ProjectionRow`.
-        minutes: Wall time, including the training that it started from; trainings may run in parallel.
+        minutes: Wall time, including that of the run that it started from; runs may share the processor.
     """
 
     claim: str
@@ -65,7 +65,7 @@ class Comparison:
 
     @property
     def fair(self) -> bool:
-        """Whether the measure means the same for both settings, unlike losses of codes of two exponents."""
+        """Whether the measure means the same for both settings, unlike losses under different exponents."""
         return (self.claim, self.measure) != (ADJUSTMENT, "prediction")
 
 
@@ -136,7 +136,7 @@ def list_comparisons(depth: bool = False) -> Iterator[Comparison]:
 
 
 def _rival_changes(depth: bool) -> Iterator[tuple[str, str, str, str, tuple[_Measure, ...]]]:
-    """Yield Table I's claims about each rival, as rows of _CHANGES; with `depth`, only its depth column."""
+    """Yield Table I's claims about each rival, as rows of _CHANGES; with `depth`, only for Propeller."""
     for rival in ("densemapnet", "dispnet", "psmnet"):
         claim = NETWORKS_SHORT if rival == "psmnet" else NETWORKS
         measures = (
@@ -218,8 +218,8 @@ def propeller_table(rows: Sequence[PaperRow]) -> str:
 def settings_table(rows: Sequence[PaperRow], claim: str, depth: bool = False) -> str:
     """Return a Markdown table of a claim's settings, as means over their seeds, by ascending filled MAE.
 
-    Settings with one seed come last, because a single score does not compare with a mean. With `depth` as the
-    target, end-point errors are given in cm too.
+    Settings with one seed come last, because a single score cannot be compared with a mean. With `depth` as
+    the target, end-point errors are given in cm too.
     """
     columns = {name: column for name, column in _COLUMNS.items() if depth or name != "epe_cm"}
     headings = ["setting", "seeds", *(heading for heading, _ in columns.values())]

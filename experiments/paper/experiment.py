@@ -26,14 +26,14 @@ def plan(
 
     Args:
         base: The paper's recipe for the data at hand; the exponent is fitted to its training pairs.
-        runs: Folder of the runs, with cached pairs in `pairs`.
-        seeds: Number of repetitions of each training, with different seeds.
+        runs: Folder of the runs, with cached pairs in the subfolder `pairs`.
+        seeds: Number of times that each setting is trained, with different seeds.
         console: Console that shows the progress.
         claims: Names in CLAIMS.
 
     Raises:
-        StereoweaveError: If the base has another network, too few steps, or depth as its target for
-            pairs without a camera.
+        StereoweaveError: If the base has another network or too few steps, or if its target is depth and its
+            pairs have no camera.
     """
     _check_base(base)
     training, _ = (cache_pairs(pairs, console) for pairs in open_sources(base, runs / "pairs"))
@@ -47,12 +47,12 @@ def plan(
 
 
 def run_trials(planned: Iterable[Trial], runs: Path, jobs: int, console: Console) -> None:
-    """Train each trial in its own folder of `runs`. Interrupted trainings resume.
+    """Train each trial in its own folder of `runs`. Interrupted training runs resume.
 
     Args:
-        planned: Trials whose training pairs all exist, so that no two trainings create the same ones.
+        planned: Trials whose training pairs all exist, so that no two training runs create the same ones.
         runs: Folder of the runs.
-        jobs: Number of trainings that run in parallel and share the processor's cores.
+        jobs: Number of training runs in parallel, which share the processor's cores.
         console: Console that shows the progress.
     """
     recipes = {trial.recipe.name: trial.recipe for trial in planned}.values()

@@ -77,7 +77,7 @@ def draw_validation(path: str | Path, curves: Mapping[str, Sequence[Sequence[tup
 
 
 def draw_iterations(path: str | Path, rows: Sequence[Estimated]) -> None:
-    """Write Fig. 3: left image, estimates after growing numbers of steps, and ground truth (unknown: black).
+    """Write Fig. 3: left image, estimates after more and more steps, and ground truth (black if unknown).
 
     The colours of a row span the range of its ground truth: blue is far, red is near.
     """

@@ -55,10 +55,10 @@ class Report:
         base: Recipe that the trials start from.
         training, held_out: Pairs of the base recipe.
         planned: All trials.
-        trained: Trials whose training is finished.
-        missing: Names of the other trials' recipes.
-        kept: Checkpoints of the trained trials, by the recipe's name.
-        curves: Scores of the trained trials in the order of steps, by the recipe's name.
+        trained: Trials that are fully trained.
+        missing: Recipe names of the unfinished trials.
+        kept: Checkpoints of the trained trials, by recipe name.
+        curves: Scores of the trained trials in order of steps, by recipe name.
         rows: One row per trained trial.
         common: Scores of untrained methods on the base's held-out pairs.
     """
@@ -200,7 +200,7 @@ def _format_report(report: Report, run_time: str) -> str:
 
 
 def _describe_setup(report: Report) -> list[str]:
-    """Describe the settings of all trainings, deviations from the paper, and how to read the tables."""
+    """Describe the settings of all training runs, deviations from the paper, and how to read the tables."""
     base = report.base
     transfer_seed = f" (the transfer: seed {OTHER_SEED})" if base.dataset == COLLAGE else ""
     unknown = (
@@ -281,7 +281,7 @@ def _format_common_table(rows: Sequence[ProjectionRow], depth: bool) -> str:
 
 
 def _describe_transfer(report: Report) -> str:
-    """Describe after how many steps the tuned network reaches the best loss of the training from scratch."""
+    """Describe how many steps the tuned network takes to reach the best loss of training from scratch."""
     curves = {
         trial.setting: report.curves[trial.recipe.name] for trial in report.trained if trial.claim == TRANSFER
     }
@@ -302,7 +302,7 @@ def _describe_transfer(report: Report) -> str:
 
 
 def _draw(report: Report, out: Path) -> None:
-    """Draw Figs. 2, 3 and 5, and Fig. 2 for the projection loss, for claims whose trials are finished."""
+    """Draw Figs. 2, 3 and 5, and Fig. 2 for the projection loss, for claims that have finished trials."""
     held_out = report.held_out
     claims = {row.claim for row in report.rows}
     if ADJUSTMENT in claims:
@@ -328,7 +328,7 @@ def _load_first_seeds(report: Report, claim: str) -> dict[str, DisparityMethod]:
 
 
 def _curves_by_setting(report: Report, claim: str) -> dict[str, list[list[tuple[int, float]]]]:
-    """Return lists of (step, squared error) for each setting, one per seed; a training counts once."""
+    """Return curves of (step, squared error) for each setting, one per seed; each recipe counts once."""
     # Reversed, so that the first trial of a name is kept.
     once = {trial.recipe.name: trial for trial in reversed(report.trained) if trial.claim == claim}
     found: dict[str, list[list[tuple[int, float]]]] = {}

@@ -1,4 +1,4 @@
-"""Trainings of the paper's experiment: for each claim, recipes that differ in one respect only."""
+"""Training runs of the paper's experiment: for each claim, recipes that differ in one respect only."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -36,15 +36,15 @@ OTHER_SIZE = 1.5
 
 
 def list_trials(base: Recipe, seeds: int, fitted_exponent: float) -> list[Trial]:
-    """List all trainings of the experiment, the most important first.
+    """List all training runs of the experiment, the most important first.
 
-    A training that serves several claims is listed once for each, with the same recipe name. The transfer to
+    A run that serves several claims is listed once for each, with the same recipe name. The transfer to
     another set needs collages, because a recipe names only one dataset on disk.
 
     Args:
         base: The paper's recipe for the data at hand.
-        seeds: Number of repetitions of each training, except for DispNet, PSMNet, the transfer and the
-            iterations, which run once.
+        seeds: Number of times that each setting is trained, except for DispNet, PSMNet, the transfer and the
+            iterations, which are trained once.
         fitted_exponent: The exponent p fitted to the histogram of the ground truth that the base trains on.
     """
     # Otherwise every training would replace its exponent p by the fitted one.
@@ -93,7 +93,7 @@ def _rival_changes(model: str) -> dict[str, Any]:
 
 
 def _other_losses(base: Recipe) -> tuple[str, ...]:
-    """Return the losses that the paper compares with l2; perceptual needs a file that cannot be shipped."""
+    """Return the losses that the paper compares with l2; perceptual only if its weights are given."""
     return ("l1", "smooth_l1", "cross_entropy", *(("perceptual",) if base.vgg16_weights else ()))
 
 

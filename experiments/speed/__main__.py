@@ -27,7 +27,7 @@ def speed(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line. Returns its exit code."""
+    """Run the command line, and return its exit code."""
     return run(speed, "experiments.speed", arguments)
 
 

@@ -44,7 +44,7 @@ class SpeedRow:
 def measure_run_times(
     recipe: Recipe, networks: Sequence[str] = NETWORKS, turns: int = TURNS
 ) -> list[SpeedRow]:
-    """Return a row per network. Networks are timed in turns, so that slow phases affect all alike.
+    """Return a row per network. Networks take turns, so that slow phases affect all alike.
 
     Args:
         recipe: Recipe of the networks, except that the target becomes disparity up to 192 px.

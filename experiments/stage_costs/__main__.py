@@ -33,7 +33,7 @@ def stage_costs(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line. Returns its exit code."""
+    """Run the command line, and return its exit code."""
     return run(stage_costs, "experiments.stage_costs", arguments)
 
 

@@ -188,7 +188,7 @@ def measure(graph: onnx.ModelProto, stages: Mapping[str, str], turns: int) -> di
     Args:
         graph: Graph with inputs of one fixed size.
         stages: Result of `find_stages`; if empty, only TOTAL is measured.
-        turns: Number of repetitions after one for warm-up.
+        turns: Number of timed repetitions, after one to warm up.
     """
     profiles = [profile(graph, threads, turns) for threads in (1, 2)]
     of_kernels = [_assign_kernels(each.optimised, stages) for each in profiles]
@@ -213,7 +213,7 @@ def measure(graph: onnx.ModelProto, stages: Mapping[str, str], turns: int) -> di
 
 
 def profile(graph: onnx.ModelProto, threads: int, turns: int) -> Profile:
-    """Profile a graph on random float32 inputs, for `turns` turns after one for warm-up."""
+    """Profile a graph on random float32 inputs, `turns` times after one run to warm up."""
     with tempfile.TemporaryDirectory() as folder:
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads
@@ -257,7 +257,7 @@ def _assign_kernels(optimised: onnx.ModelProto, stages: Mapping[str, str]) -> di
 
 
 def _min_ms(profiled: Profile, stages: Mapping[str, str], stage: str) -> float:
-    """Return the minimum of a stage's time over the turns."""
+    """Return the minimum time of a stage over the turns, in milliseconds."""
     kernels = [times for name, times in profiled.kernels_ms.items() if stages[name] == stage]
     return min(map(sum, zip(*kernels, strict=True)), default=0.0)
 

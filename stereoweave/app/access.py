@@ -1,4 +1,4 @@
-"""Access control for the page: visitors can reach only the necessary routes and their own files."""
+"""Access control for the page: visitors can reach only the routes they need and their own files."""
 
 import json
 import re
@@ -196,7 +196,7 @@ async def _read_json(request: Request) -> tuple[Any, bytes]:
 
 
 def _find_paths(value: Any) -> Iterator[Any]:
-    """Yield the value of every key `path` in a nested value.
+    """Yield the value of each `path` key in a nested value.
 
     Gradio treats any mapping with this key as a file.
     """

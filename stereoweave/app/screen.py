@@ -68,7 +68,7 @@ class Screen(ThreadingHTTPServer):
         self.server_close()
 
     def close(self) -> None:
-        """End all streams after the newest image."""
+        """End all streams after they have sent the newest image."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
@@ -108,7 +108,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_error(404)
 
     def log_message(self, format: str, *values: object) -> None:
-        """Log nothing; otherwise, each request would print a line on the terminal."""
+        """Log nothing; otherwise, each request would print a line to the terminal."""
 
     def _send_headers(self, kind: str) -> None:
         self.send_response(200)

@@ -1,4 +1,4 @@
-"""Matching, drawing, measurement and output for a visitor of the web page, without the user interface."""
+"""Matching, drawing, measurement and output for a visitor to the web page, without the user interface."""
 
 import zipfile
 from collections.abc import Callable, Sequence
@@ -193,8 +193,9 @@ def _describe_pixel(result: Result, point: tuple[int, int]) -> str:
 def _assume_camera(estimate: Estimate) -> StereoCamera:
     """Return a camera that gives a plausible point cloud.
 
-    It has a field of view of 53 degrees and a baseline of 65 mm, as between human eyes. Negative disparities
-    indicate converged cameras; points with the lowest disparities are then assumed to be infinitely far away.
+    It has a field of view of 53 degrees and a baseline of 65 mm, about the distance between human eyes.
+    Negative disparities indicate converged cameras; points with the lowest disparities are then assumed to be
+    infinitely far away.
     """
     height, width = estimate.disparity_px.shape
     return StereoCamera(

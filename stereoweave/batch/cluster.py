@@ -171,7 +171,7 @@ def _adapt_job(job: DepthJob, engine: Engine) -> DepthJob:
 
 
 def _open_store(place: str | Path) -> Store:
-    """Open a folder or URL as a store. Paths become absolute, because workers have other working folders."""
+    """Open a folder or URL as a store. Paths become absolute, as workers have different working folders."""
     store = store_at(place)
     return store if store.folder is None else store_at(store.folder.absolute())
 

@@ -175,7 +175,7 @@ def _collect_outcomes(
 def _process_until_killed(
     work: Work, waiting: deque[NamedPair], processes: int, threads: int | None
 ) -> Generator[Outcome, None, list[NamedPair]]:
-    """Yield the outcomes of the waiting pairs. If a process is killed, return the pairs in progress."""
+    """Yield the outcomes of the waiting pairs until a process is killed; return those still in progress."""
     pending: dict[Future[str | None], NamedPair] = {}
     with _start_pool(processes, threads or usable_cores()) as pool:
         try:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 MANIFEST, PLAN = "manifest", "plan"
 MOST_IN_A_CHUNK = 32
-"""Maximum number of pairs in a chunk, and thus the maximum number to repeat after a worker dies."""
+"""Maximum number of pairs in a chunk, and thus the maximum number to process again after a worker dies."""
 _CHUNKS_PER_WORKER = 8
 _CHUNKS_PER_FILE = 64
 _PART = re.compile(r"part-(\d{8})\.parquet")
@@ -49,7 +49,7 @@ class PlanEntry:
 
 @dataclass(frozen=True)
 class ChunkPlan:
-    """Plan of a batch: the numbers of its chunks, the count of pairs and videos, and notes for the user."""
+    """Plan of a batch: the chunk indices, the number of pairs and videos, and notes for the user."""
 
     chunks: tuple[int, ...]
     count: int

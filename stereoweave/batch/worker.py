@@ -130,7 +130,7 @@ class ChunkWorker:
         return [self.make_row(entry) for entry in missing]
 
     def _make_rows_in_child(self, missing: Sequence[PlanEntry], mark: str) -> list[ManifestRow]:
-        """Process pairs in a child process, with limited attempts per pair, and return their rows."""
+        """Process pairs in a child process, each with a limited number of attempts; return their rows."""
         marked = self._read_mark(mark)
         tries, rows = marked.get("tries", {}), {row["pair"]: row for row in marked.get("rows", [])}
         with _RowProcess(self) as child:

@@ -18,7 +18,7 @@ FLYING_PX = 2.0
 
 
 def near_edge(truth_px: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Return the mask of the known pixels within three pixels of an edge, also diagonally."""
+    """Return the mask of the known pixels within three pixels of an edge, including diagonally."""
     known_px = np.where(np.isfinite(truth_px), truth_px, np.nan).astype(np.float64)
     at_edge = np.zeros(truth_px.shape, np.uint8)
     for axis in (0, 1):

@@ -88,7 +88,7 @@ def class_errors(
     truth_px: Float[np.ndarray, "h w"],
     masks: dict[str, Bool[np.ndarray, "h w"]],
 ) -> dict[str, ClassErrors]:
-    """Return an estimate's errors in each class and, last, over `ALL` known pixels.
+    """Return an estimate's errors in each class, followed by those over all known pixels (`ALL`).
 
     Args:
         estimate_px: Disparity of the left view; NaN counts as bad.
@@ -103,7 +103,7 @@ def class_errors(
 
 
 def find_covered(truth_px: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Return the mask of the known pixels that a surface nearer by more than 1 px covers in the right image.
+    """Return the mask of the known pixels covered in the right image by a surface over 1 px nearer.
 
     Only the left truth is used: every known pixel is projected to the nearest column of the right image,
     where the nearest surface is kept.

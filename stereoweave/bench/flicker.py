@@ -46,7 +46,7 @@ class FlickerRow:
             noise-free images, so it flickers only if the disparity flickers.
         epe_px: End-point error of the left view.
         moving_epe_px: End-point error on the moving object; NaN if there is none.
-        uncovered_epe_px: End-point error on pixels that the previous frame did not show; NaN if there are
+        uncovered_epe_px: End-point error at points that the previous frame did not show; NaN if there are
             none.
         time_ms: Median time of the temporal filter per frame; NaN if the filter is not used.
     """
@@ -85,7 +85,7 @@ def score_flicker(  # noqa: PLR0913 - each is an option of the command line
     threads: int | None = None,
     provider: str = CPU,
 ) -> Iterator[FlickerRow]:
-    """Yield two rows, without and with the temporal filter, for each of the four videos of a scene.
+    """Yield two rows, without and with the temporal filter, for each of the four videos of each scene.
 
     Args:
         scenes: Scene names, as for `stereoweave synth make`.

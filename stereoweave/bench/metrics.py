@@ -109,7 +109,7 @@ def calibration_error(probability: Float[np.ndarray, "..."], happened: Bool[np.n
 def calibration_bins(
     probability: Float[np.ndarray, "..."], happened: Bool[np.ndarray, "..."]
 ) -> Float[np.ndarray, "3 n"]:
-    """Return the mean probability, the observed frequency and the share of values of each non-empty bin."""
+    """Return the mean probability, the observed frequency and the share of values in each non-empty bin."""
     where = np.minimum((probability * _BINS).astype(int), _BINS - 1).ravel()
     counts = np.bincount(where, minlength=_BINS)
     used = counts > 0
@@ -134,7 +134,7 @@ def sparsification(error: Float[np.ndarray, " n"], confidence: Float[np.ndarray,
 def _average_kept(
     error: Float[np.ndarray, " n"], confidence: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, " m"]:
-    """Return the mean error of the pixels that remain after each of `DROPPED_PERCENT` is dropped."""
+    """Return the mean error of the pixels that remain at each percentage of `DROPPED_PERCENT`."""
     if not error.size:
         return np.full(len(DROPPED_PERCENT), np.nan)
     _, group, counts = np.unique(-confidence, return_inverse=True, return_counts=True)

@@ -83,7 +83,7 @@ def fill_rows(disparity_px: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "
 def left_right_confidence(
     disparity_px: Float32[np.ndarray, "h w"], right_disparity_px: Float32[np.ndarray, "h w"]
 ) -> Float32[np.ndarray, "h w"]:
-    """Return the negated left-right disagreement in px, which is a ranking and not a probability.
+    """Return the negated left-right disagreement in px, which ranks pixels but is not a probability.
 
     The best value is 0. The result is minus infinity where either disparity is a hole (<= 0) or the match
     lies outside the right view.

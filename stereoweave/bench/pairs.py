@@ -45,8 +45,9 @@ from stereoweave.system.ray_engine import Engine, stream
 MatchFunction = Callable[[StereoPair], Estimate | Float[np.ndarray, "h w"]]
 """The timed function, which returns an Estimate or only the left disparity in px [H, W], <= 0 in holes.
 
-Holes in a disparity map are then filled along rows. Confidence comes from the left-right check, for which the
-mirrored pair is also matched. Neither step is timed, because users may choose methods with other costs.
+If it returns only the disparity, holes are then filled along rows, and the mirrored pair is matched too, to
+derive confidence from the left-right check. Neither step is timed, because users may choose methods with
+other costs.
 """
 
 MatcherFactory = Callable[[], MatchFunction]
@@ -145,7 +146,7 @@ def score_all(
     score: Callable[[Mapping[str, Any], AnyScene], AnyResult],
     engine: Engine | None,
 ) -> list[SceneResult[AnyResult]]:
-    """Apply `score` to the matchers and each scene. Returns the results in the order of the scenes.
+    """Score the matchers on each scene with `score`, and return the results in the order of the scenes.
 
     For arguments and errors see `score_pairs`.
     """
@@ -184,7 +185,7 @@ def add_memory(
 
 
 class _SceneScorer:
-    """Scorer of scenes by number, which makes the matchers only once."""
+    """Callable that scores the scene of a given index, with matchers that are made only once."""
 
     def __init__(
         self,

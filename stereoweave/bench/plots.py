@@ -58,7 +58,7 @@ def draw_error_over_time(path: str | Path, rows: Sequence[MatcherRow]) -> None:
 
 
 def draw_sparsification(path: str | Path, curves: Mapping[str, Curves]) -> None:
-    """Write plots of bad-1 and EPE against the share of pixels dropped by confidence. Oracles are dashed.
+    """Write plots of bad-1 and EPE against the share of pixels dropped by confidence, with dashed oracles.
 
     Args:
         path: Picture to write; its extension selects the format.

@@ -40,7 +40,7 @@ def project_right(left: UInt8[np.ndarray, "h w 3"], disparity_px: Float[np.ndarr
 def fill_from_rows(view: View) -> UInt8[np.ndarray, "h w 3"]:
     """Fill the pixels that were not drawn with colours of drawn pixels in the same row.
 
-    The next drawn pixel on the right is used or, if there is none, the last one on the left.
+    Each takes the colour of the nearest drawn pixel on its right or, if there is none, on its left.
 
     In a right view projected from the left image, nearer surfaces move farther left, so the area that they
     uncover has background on its right. The fill therefore needs no disparity and treats all methods alike. A

@@ -131,7 +131,7 @@ def write_csv(path: str | Path, rows: Sequence[Any], machine: dict[str, str] | N
 
     Args:
         path: The CSV file; its folder is created.
-        rows: At least one instance of one dataclass, whose fields are the columns.
+        rows: One or more instances of the same dataclass, whose fields are the columns.
         machine: Processor, number of cores and OpenCV version. Default: those of this machine.
     """
     machine = machine or describe_machine()

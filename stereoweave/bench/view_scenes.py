@@ -1,4 +1,4 @@
-"""Pairs with reference pictures from between or beyond the cameras, real or rendered, to score new views."""
+"""Pairs with reference pictures from between or beyond the cameras, for scoring new views."""
 
 import json
 from collections.abc import Callable, Iterator
@@ -132,7 +132,7 @@ def _parse_position(path: Path) -> float:
 
 
 def _read_disparity(folder: Path, name: str, *, pair: StereoPair) -> Float[np.ndarray, "h w"]:
-    """Read the named disparity from a PFM or else a PNG file; all NaN (unknown) if neither exists."""
+    """Read the named disparity from a PFM file, or else a PNG file; all NaN (unknown) if neither exists."""
     readers: dict[str, Callable[[Path], Float[np.ndarray, "h w"]]] = {
         ".pfm": read_pfm,
         ".png": read_disparity_png,

@@ -53,7 +53,7 @@ def land_disparities(disparity_px: Float[np.ndarray, "h w"], way: float) -> Floa
 
     Args:
         disparity_px: Disparity of an input image; NaN where unknown.
-        way: Shift per disparity: column x lands on the pixel nearest to x + way * disparity_px.
+        way: Shift in px per px of disparity: column x lands on the pixel nearest to x + way * disparity_px.
     """
     height, width = disparity_px.shape
     landed = np.full((height, width), -np.inf, np.float32)

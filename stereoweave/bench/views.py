@@ -196,7 +196,7 @@ def _has_truth(sample: Sample) -> bool:
 
 
 def _classify_pixels(sample: Sample, position: float) -> dict[str, Bool[np.ndarray, "h w"]]:
-    """Return a mask per kind of pixel, by the prefix of its columns; all False if the truth is unknown."""
+    """Return masks by kind of pixel, named as in the column prefixes; all False if the truth is unknown."""
     if not _has_truth(sample):
         return dict.fromkeys(("smooth", "edge", "one", "neither"), np.zeros(sample.left.shape[:2], bool))
     truth = find_view_truth(sample, position)
@@ -209,7 +209,7 @@ def _classify_pixels(sample: Sample, position: float) -> dict[str, Bool[np.ndarr
 def _measure_errors(
     image: UInt8[np.ndarray, "h w 3"], true: ReferenceView, kinds: Mapping[str, Bool[np.ndarray, "h w"]]
 ) -> dict[str, float]:
-    """Return the columns that compare the two images."""
+    """Return the score columns that compare the image with the reference image."""
     errors = {
         "psnr_db": psnr_db(image, true.image),
         "ssim": ssim(image, true.image),

@@ -61,7 +61,7 @@ class Alignment:
         vertical_shift_px: Vertical shift of the right image at its centre; positive if that image is lower.
         rotation_degrees: Clockwise rotation of the right image.
         range_px: Least and greatest disparity, without the outermost 1 % at each end.
-        exposure_ratio: Exposure of the right image divided by the left image's exposure; NaN if unknown.
+        exposure_ratio: Exposure of the right image divided by that of the left image; NaN if unknown.
         defects: Names of the defects found, from `DEFECTS`; empty for a sound pair.
     """
 
@@ -192,7 +192,7 @@ def check_pair(left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3
 def _measure_range(
     disparity_px: Float[np.ndarray, " n"], negative_px: Float[np.ndarray, " m"]
 ) -> tuple[float, float]:
-    """Return the disparity range without 1 % at each end; ignore negative values if none are reliable."""
+    """Return the disparity range, less 1 % at each end; ignore negative values if none are reliable."""
     at_least_0 = disparity_px[disparity_px >= 0]
     counted_px = disparity_px if len(negative_px) or not len(at_least_0) else at_least_0
     least_px, greatest_px = np.percentile(counted_px, [_OUTER_PERCENT, 100 - _OUTER_PERCENT])
@@ -220,9 +220,9 @@ def _fit_vertical_error(
 ) -> tuple[Bool[np.ndarray, " n"], float, float, float] | None:
     """Fit the vertical error; return inliers, shift in px, slope and the size of the other terms in px.
 
-    The vertical error is a field over the right picture. Its constant term is a shift, and its term in x is a
-    rotation. Scale, pitch and convergence cause the other terms, up to second order. Returns None if no field
-    explains enough matches.
+    The vertical error is modelled as a quadratic function of the position in the right picture. The constant
+    term is a shift, and the term in x is a rotation; scale, pitch and convergence cause the other terms.
+    Returns None if no such function explains enough matches.
     """
     x, y = ((matches.right_px - centre_px) / centre_px[0]).T
     terms = np.stack([np.ones_like(x), x, y, x * y, x * x, y * y], axis=1)
@@ -242,7 +242,7 @@ def _fit_vertical_error(
 def _find_plane_inliers(
     terms: Float[np.ndarray, "n 3"], values: Float[np.ndarray, " n"], tolerated: float
 ) -> Bool[np.ndarray, " n"]:
-    """Return the inliers of the best plane by RANSAC; the zero plane is one of the candidates."""
+    """Return the inliers of the best plane found by RANSAC; the zero plane is one of the candidates."""
     rng = np.random.default_rng(0)
     picked = rng.integers(0, len(values), (_TRIALS, 3))
     through = terms[picked]

@@ -18,8 +18,8 @@ class Board:
     """A printed chessboard, or a ChArUco board if `dictionary` is given.
 
     Attributes:
-        columns, rows: As in OpenCV, number of inner corners of a chessboard, where four squares meet, or
-            number of squares of a ChArUco board.
+        columns, rows: Size of the board, counted as in OpenCV: in inner corners (where four squares meet)
+            for a chessboard, in squares for a ChArUco board.
         square_m: Side length of a square.
         marker_m: Side length of a marker on a ChArUco board.
         dictionary: OpenCV's name for the marker dictionary, such as DICT_5X5_100.

@@ -132,7 +132,7 @@ def calibrate(
 ) -> Calibration:
     """Calibrate a rig from a folder of board pictures.
 
-    Two pictures form a pair if their paths differ only in left and right, L and R, or cam0 and cam1. Examples
+    Two pictures form a pair if their paths differ only in left vs right, L vs R, or cam0 vs cam1. Examples
     are left/01.png and right/01.png, left01.png and right01.png, and 01_L.png and 01_R.png. A pair is left
     out and reported if a picture is damaged or lacks the board, or if the pair's error exceeds three times
     the median.
@@ -182,7 +182,7 @@ def _check_enough(count: int, total: int, board: Board, left_out: Mapping[str, s
 
 
 def find_pairs(folder: Path) -> tuple[dict[str, tuple[Path, Path]], dict[str, str]]:
-    """Return both pictures of each pair, by name, and the reason for each picture that is left out."""
+    """Return both pictures of each pair, by name, and the reason why each other picture is left out."""
     if not folder.is_dir():
         raise StereoweaveError(f"{folder}: expected a folder with pictures of a board, found no such folder")
     sides: dict[str, dict[bool, Path]] = {}

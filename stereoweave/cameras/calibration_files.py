@@ -36,7 +36,7 @@ def read_rig(path: str | Path, size_px: Size | None = None) -> Rig:
     """Read the rig from a calibration file, whose format is detected from the content.
 
     Formats:
-        OpenCV's YAML, XML or JSON (cv2.FileStorage), with the entry names in OpenCV's examples (M1, D1, M2,
+        OpenCV's YAML, XML or JSON (cv2.FileStorage), with the entry names from OpenCV's examples (M1, D1, M2,
         D2, R and T) or common variants such as K1 or cameraMatrix1. An extrinsics.yml is completed by the
         intrinsics.yml beside it, and vice versa. If there is no entry translation_unit (m, cm or mm), a
         translation longer than 2 is assumed to be in millimetres and a shorter translation in metres. If
@@ -161,7 +161,7 @@ def _parse_opencv(entries: Mapping[str, Any]) -> Rig:
 
 
 def _parse_opencv_parts(plain: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Return the intrinsics and extrinsics, whichever of their known names the file uses."""
+    """Return the intrinsics and extrinsics, under whichever of their known names the file stores them."""
     found = {
         f"{what} {side}": _find_side(plain, names, sides)
         for side, sides in (("left", ("1", "left", "l")), ("right", ("2", "right", "r")))

@@ -146,7 +146,7 @@ def estimate_depth_order(
     """Return the depth order in -1..1: positive if greater disparities occlude smaller ones, else negative.
 
     In the left picture, an area that is occluded in the right one lies between a surface of smaller
-    disparity and a surface of greater disparity. The area belongs to the farther surface and has the same
+    disparity and a surface of greater disparity. The area belongs to the farther surface and shares its
     colour.
     """
     factor = min(1.0, _OCCLUSION_WIDTH_PX / left.shape[1])
@@ -162,7 +162,7 @@ def estimate_depth_order(
 def _vote_in_row(
     disparity_px: Float32[np.ndarray, " w"], seen: Bool[np.ndarray, " w"], colours: Float32[np.ndarray, "w 3"]
 ) -> list[float]:
-    """Return a vote in -1..1 for each occluded run in a row: positive if the run resembles its left side."""
+    """Return a vote in -1..1 for each occluded run in a row: positive if it resembles pixels on its left."""
     votes = []
     changes = np.diff(seen.astype(np.int8))
     ends = np.flatnonzero(changes == 1) + 1

@@ -11,15 +11,15 @@ from jaxtyping import Bool, Float, UInt8
 class PictureWarp:
     """Warp of a picture, for its pixels and for points.
 
-    Distortion follows the division model: a point at the distance r from the centre, in half diagonals, is
-    moved to the distance r / (1 + distortion * r^2).
+    Distortion follows the division model: a point at distance r from the centre (in half diagonals) is
+    moved to distance r / (1 + distortion * r^2).
 
     Source: "Simultaneous linear estimation of multiple view geometry and lens distortion" (Fitzgibbon 2001).
 
     Attributes:
         homography: [3, 3], maps undistorted to warped pixels.
-        distortion: Distortion of the lens; a positive one moves points towards the centre, and 0 none.
-        size_px: Width and height of the picture before and after.
+        distortion: Lens distortion; positive values move points towards the centre, and 0 moves none.
+        size_px: Width and height of the picture, both before and after the warp.
     """
 
     homography: Float[np.ndarray, "3 3"]
@@ -27,7 +27,7 @@ class PictureWarp:
     size_px: tuple[int, int]
 
     def transform(self, places_px: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Return where points of the source picture are in the warped one."""
+        """Map points of the source picture to their positions in the warped picture."""
         undistorted = undistort(places_px, self.distortion, self.size_px)
         return cv2.perspectiveTransform(undistorted[None], self.homography)[0]
 
@@ -50,7 +50,7 @@ class PictureWarp:
         return warped, shown == 255
 
     def _find_sources(self) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
-        """Return column and row in the source picture of each pixel of the warped one, as float32."""
+        """Return the source column and row, as float32, of each pixel of the warped picture."""
         width, height = self.size_px
         inverse = np.linalg.inv(self.homography).astype(np.float32)
         x, y = np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)[:, None]
@@ -65,7 +65,7 @@ class PictureWarp:
 def undistort(
     places_px: Float[np.ndarray, "n 2"], distortion: float, size_px: tuple[int, int]
 ) -> Float[np.ndarray, "n 2"]:
-    """Return the places without radial distortion (`PictureWarp`)."""
+    """Return the points with radial distortion removed (see `PictureWarp`)."""
     centre_px = (np.array(size_px) - 1) / 2
     from_centre = places_px - centre_px
     squares = (from_centre**2).sum(1, keepdims=True) / _half_diagonal_px(size_px) ** 2

@@ -37,7 +37,7 @@ def rectify(pair: StereoPair, rig: Rig) -> Rectified:
     Both cameras are rotated to a common direction, between their own directions and perpendicular to the
     baseline. The new focal length is the mean of both focal lengths, to preserve the resolution in the
     middle. Both views share one principal point (doffs 0), chosen to keep most of each view visible. If the
-    rig is rectified already, the pictures do not change.
+    rig is already rectified, the pictures do not change.
 
     Raises:
         FormatError: The rig is for pictures of a different size.
@@ -145,7 +145,7 @@ def _rectify_view(
 ) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
     """Warp a picture to the rectified camera; return it with the mask of its valid pixels.
 
-    The border is repeated outside the picture, because an edge at the border would be matched.
+    The border is repeated outside the picture, so that matching finds no false edge there.
     """
     height, width = image.shape[:2]
     pinhole = np.array([[camera.focal_px, 0, camera.cx_px], [0, camera.focal_px, camera.cy_px], [0, 0, 1]])
@@ -221,7 +221,7 @@ def _find_largest_rectangle(full: Bool[np.ndarray, "h w"]) -> tuple[slice, slice
 
 
 def _find_full_cells(full: Bool[np.ndarray, "h w"], cell_px: int) -> Bool[np.ndarray, "rows columns"]:
-    """Return which cells are full; of a cell that the picture's border cuts, only the pixels inside count."""
+    """Return which cells are full; in a cell cut by the picture's border, only the pixels inside count."""
     height, width = full.shape
     padded = np.pad(full, ((0, -height % cell_px), (0, -width % cell_px)), constant_values=True)
     cells = padded.reshape(-1, cell_px, padded.shape[1] // cell_px, cell_px)
@@ -229,10 +229,10 @@ def _find_full_cells(full: Bool[np.ndarray, "h w"], cell_px: int) -> Bool[np.nda
 
 
 def _find_largest_of_cells(full: Bool[np.ndarray, "rows columns"]) -> tuple[int, int, int, int]:
-    """Return the top, bottom, start and stop of the largest rectangle of full cells.
+    """Return the largest rectangle of full cells: top and bottom rows, start and stop columns.
 
-    For each row, a histogram counts the consecutive full cells upwards, and a stack of bars finds the largest
-    rectangle under the histogram.
+    For each row, a histogram counts each column's consecutive full cells upwards, and a stack of bars finds
+    the largest rectangle under the histogram.
     """
     best, found = 0, (0, 0, 0, 0)
     heights = np.zeros(full.shape[1], int)

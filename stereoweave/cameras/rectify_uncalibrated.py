@@ -141,7 +141,7 @@ def _fit_cameras(matches: Matches, size_px: tuple[int, int]) -> Float[np.ndarray
 
 
 def _make_warps(parameters: Float[np.ndarray, " 8"], size_px: tuple[int, int]) -> Warps:
-    """Return each match's warps of two cameras.
+    """Return the warps of both pictures, given the parameters of the two cameras.
 
     The left camera is rotated by yaw and roll, and the right one by pitch, yaw and roll. A common pitch does
     not change the alignment of rows, so the left camera has none. Both lenses have the same distortion.
@@ -170,7 +170,7 @@ def _make_warps(parameters: Float[np.ndarray, " 8"], size_px: tuple[int, int]) -
 
 
 def _measure_sampson_px(warps: Warps, matches: Matches) -> Float[np.ndarray, " n"]:
-    """Return each match's Sampson error: its first-order distance from its epipolar lines, undistorted."""
+    """Return each match's Sampson error: first-order distance, in undistorted px, from its epipolar lines."""
     across = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     fundamental = warps.right.homography.T @ across @ warps.left.homography
     ones = np.ones((len(matches.left_px), 1))
@@ -197,7 +197,7 @@ def _check(parameters: Float[np.ndarray, " 8"], residual_px: float, width: int, 
 
 
 def _align_views(warps: Warps, matches: Matches) -> tuple[Warps, float]:
-    """Keep the left picture centred, and shift the right one to the left if needed for disparities >= 0.
+    """Keep the left picture centred, and shift the right one to the left if disparities would be negative.
 
     Returns the warps and the sideways shift of the right picture in px.
     """

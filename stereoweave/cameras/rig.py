@@ -178,7 +178,7 @@ def make_rectified_rig(
 ) -> Rig:
     """Return a rectified rig from the first three columns of two camera or projection matrices.
 
-    The right camera is `-aside_m` metres to the right of the left one.
+    `aside_m` is the x translation from the left camera to the right one: minus the baseline.
     """
     return Rig(
         left=Optics(matrix=left[:, :3], distortion=np.zeros(0)),

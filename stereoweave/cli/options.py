@@ -152,7 +152,7 @@ def make_request(
 
 
 def parse_range_px(text: str | None) -> tuple[float, float] | None:
-    """Parse --range into least and greatest disparity in px; None if it is not given."""
+    """Parse --range into the least and greatest disparity in px; None if it is not given."""
     if text is None:
         return None
     low_px, high_px = _parse_two_numbers("--range", text, "least and greatest disparity, such as -20,150")
@@ -162,7 +162,7 @@ def parse_range_px(text: str | None) -> tuple[float, float] | None:
 
 
 def parse_pixel(option: str, text: str) -> tuple[int, int]:
-    """Parse an option X,Y into the column and row of a pixel."""
+    """Parse an option's value X,Y into the column and row of a pixel."""
     column, row = _parse_two_numbers(option, text, "column and row of a pixel, such as 320,240")
     return round(column), round(row)
 
@@ -200,7 +200,7 @@ def make_parent_folder(*files: Path) -> Path:
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """Open a listening socket; raises StereoweaveError if the address is not available."""
+    """Open a listening socket; raise StereoweaveError if the address is not available."""
     try:
         family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         return socket.create_server(address[:2], family=family)
@@ -219,7 +219,7 @@ def format_url(host: str, port: int) -> str:
 
 
 def find_allowed_hosts(listener: socket.socket, host: str) -> tuple[str, ...] | None:
-    """Return the names allowed in the header Host; None, for any, if other machines can reach the listener.
+    """Return the names allowed in the Host header; None (any name) if other machines can reach the listener.
 
     This prevents DNS rebinding, where a foreign site's name is made to resolve to this machine's address.
 

@@ -28,12 +28,12 @@ app.add_typer(synth, name="synth")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command `stereoweave`. Returns its exit code; see `run`."""
+    """Run the command `stereoweave`, and return its exit code; see `run`."""
     return run(app, "stereoweave", arguments)
 
 
 def run(commands: Commands, program: str, arguments: Sequence[str] | None) -> int:
-    """Run a command line. Returns its exit code, which is 2 after an error reported in one line on stderr."""
+    """Run a command line, and return its exit code: 2 after an error reported in one line on stderr."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # like stderr, for file names that are not UTF-8
     try:

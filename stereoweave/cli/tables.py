@@ -77,7 +77,7 @@ def print_means(tables: Mapping[str, Mapping[str, str]], who: str, rows: Sequenc
     Args:
         tables: Fields of the rows, by title and column heading.
         who: Field that names a row.
-        rows: Dataclasses of the same type.
+        rows: Instances of the same dataclass.
     """
     from rich.console import Console
     from rich.table import Column, Table

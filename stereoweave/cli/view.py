@@ -193,7 +193,7 @@ def _parse_convergence_px(convergence: str) -> float | None:
 
 
 def _write_view(out: Path, view: "View", position: float) -> str:
-    """Write one view. Returns a description of it for the user."""
+    """Write one view, and return a description of it for the user."""
     from stereoweave.io.images import write_image
 
     write_image(out, view.image)
@@ -201,7 +201,7 @@ def _write_view(out: Path, view: "View", position: float) -> str:
 
 
 def _write_layout(out: Path, name: str, renderer: "Renderer", layout_options: "LayoutOptions") -> str:
-    """Write several views in a layout. Returns a description of the file for the user."""
+    """Write several views in a layout, and return a description of the file for the user."""
     from stereoweave.io.animation import write_animation
     from stereoweave.rendering.layouts import ANIMATIONS, LAYOUTS, render_views, write_picture
 

@@ -1,4 +1,4 @@
-"""Training sets of KITTI stereo 2012 (Geiger et al.) and 2015 (Menze and Geiger), as unpacked."""
+"""Training sets of KITTI stereo 2012 (Geiger et al.) and 2015 (Menze and Geiger), from unpacked archives."""
 
 from dataclasses import replace
 from functools import partial

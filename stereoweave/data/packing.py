@@ -5,7 +5,7 @@
     occluded.png, right_occluded.png                1 bit
     camera.json                                     the camera in pixels and metres, and steps_per_px
 
-A rendered pair of 640x480 takes 0.4 to 1.2 MB, or 0.87 MB on average (17 pairs from all scenes). On one core,
+A rendered 640x480 pair takes 0.4 to 1.2 MB, or 0.87 MB on average (17 pairs from all scenes). On one core,
 packing takes 25 to 60 ms and unpacking takes 22 ms.
 
 KITTI's PNG format is unsuitable, because 0 means unknown in that format, but the sky has a known disparity of
@@ -125,7 +125,7 @@ def _parse_camera(content: bytes) -> tuple[int, StereoCamera | None]:
 
 
 def _choose_steps_per_px(disparities_px: Iterable[Float[np.ndarray, "h w"]]) -> int:
-    """Return the greatest number of steps per pixel for which all disparities fit in 16 bits.
+    """Return the largest number of steps per pixel for which all disparities fit in 16 bits.
 
     The number is a power of two, which makes division exact, and at most 1024.
     """

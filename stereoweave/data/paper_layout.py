@@ -5,12 +5,12 @@ The folders are left, right and depth.
 The paper states the range of the left view's depth, which is 0 to 15 m, but not the file format. Two formats
 can be read:
 
-- 16-bit grey PNG with millimetres; 0 and values beyond 15 m are unknown;
+- 16-bit grey PNG with depth in millimetres; 0 and values beyond 15 m are unknown;
 - 8-bit RGB PNG with depth as a fraction of 15 m, (R + 256 G + 65536 B) / (2^24 - 1), as in the simulator
   CARLA; 0 and the maximum, which also represents anything beyond 15 m, are unknown.
 
 Frames are written in the second format. The checksums of a frame, in sums/NAME.sha256, are written last, so a
-frame with checksums is complete. Running `sha256sum --check` in the root verifies it.
+frame with checksums is complete. Running `sha256sum --check sums/NAME.sha256` in the root verifies the frame.
 """
 
 import os

@@ -76,12 +76,12 @@ def read_scenes(folder: str | Path, dataset: str | None = None) -> Iterator[Scen
 
 
 def list_scenes(folder: str | Path, dataset: str | None = None) -> list[Callable[[], Scene]]:
-    """Return one function per scene in `folder` that reads the scene, sorted by scene name.
+    """Return a function for each scene in `folder` that reads it, sorted by scene name.
 
     A scene is a folder with left.png, right.png, a disparity map and optionally Middlebury's calib.txt. The
     map is disparity.png (16 bits, pixels * 256; 0 means unknown) or disparity.pfm (NaN and infinity mean
-    unknown). If there are no such folders, the scenes are the pairs of all rendered sets in `folder`, which
-    `stereoweave synth make` writes.
+    unknown). If there are no such folders, the scenes are the pairs of all sets in `folder` that
+    `stereoweave synth make` rendered.
 
     Args:
         folder: Folder of the scenes.
@@ -89,7 +89,7 @@ def list_scenes(folder: str | Path, dataset: str | None = None) -> list[Callable
 
     Raises:
         StereoweaveError: The folder contains no scenes, or `open_dataset` raises the error.
-        FormatError: Raised when a scene is read, if a file is missing, is damaged or has the wrong size.
+        FormatError: A file is missing, damaged or of the wrong size; raised when its scene is read.
     """
     if dataset:
         return [partial(_read_frame, frame) for frame in open_dataset(dataset, folder)]

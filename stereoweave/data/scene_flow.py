@@ -1,4 +1,4 @@
-"""Scene Flow (Mayer et al. 2016): FlyingThings3D, Driving and Monkaa, as unpacked.
+"""Scene Flow (Mayer et al. 2016): FlyingThings3D, Driving and Monkaa, from unpacked archives.
 
 The root contains the folder disparity, and frames_cleanpass, frames_finalpass or both. All these folders
 have the same subfolders, the innermost of which are named left and right.
@@ -76,8 +76,8 @@ def _read(files: list[Path], focal_px: float) -> Sample:
 def _read_disparity(path: Path, pair: StereoPair) -> Float32[np.ndarray, "h w"]:
     """Read a disparity map and return its absolute values.
 
-    Left views in the later subset have negative values. The sign carries no information, because the cameras
-    are parallel.
+    The subset of FlyingThings3D that was released later stores left disparities as negative values. The sign
+    carries no information, because the cameras are parallel.
 
     Raises:
         FormatError: The map has the wrong size or contains disparities of both signs.

@@ -2,8 +2,8 @@
 
 A set is a folder of shards, each named SET-FIRST-LAST.tar after its first and last pair, such as
 ship-000050-000099.tar. In this shard, pair 57 consists of the files that packing.py makes, such as
-ship-000057.left.webp, and of their checksums, ship-000057.sha256. Equal pairs give equal bytes. A shard is
-written atomically and never changed.
+ship-000057.left.webp, and of their checksums, ship-000057.sha256. Identical pairs give identical bytes. A
+shard is written atomically and never changed.
 """
 
 import os
@@ -101,7 +101,7 @@ class Shards:
         """List the shards of a folder.
 
         Raises:
-            FormatError: There are no shards or a gap between shards, or `list_shards` raises the error.
+            FormatError: There are no shards, there is a gap between shards, or `list_shards` fails.
         """
         self.shards = list_shards(folder, set_name)
         if not self.shards:

@@ -1,4 +1,4 @@
-"""Training set of MPI Sintel stereo (Butler et al. 2012; Wulff and Black 2015), as unpacked."""
+"""Training set of MPI Sintel stereo (Butler et al. 2012; Wulff and Black 2015), from unpacked archives."""
 
 import struct
 from dataclasses import replace

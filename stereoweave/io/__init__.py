@@ -1,4 +1,4 @@
-"""Reading and writing of pictures, maps and other files, on disks and in object stores."""
+"""Reading and writing pictures, maps and other files on disk and in object stores."""
 
 from stereoweave.io.images import read_image, read_pair, write_image
 from stereoweave.io.maps import (

@@ -1,4 +1,4 @@
-"""Writing of animations: MP4, GIF and animated WebP files."""
+"""Writing animations to MP4, GIF and animated WebP files."""
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -20,9 +20,9 @@ Frames = Iterator[UInt8[np.ndarray, "h w 3"]]
 def write_animation(path: str | Path, frames: Iterable[UInt8[np.ndarray, "h w 3"]], frame_ms: int) -> None:
     """Write frames as an animation, in the format given by the file extension: .mp4, .gif or .webp.
 
-    GIF and WebP files repeat forever; all their frames are in memory while they are written. An MP4 file
-    plays once and is written frame by frame; an odd width or height is made even by repeating the last column
-    or row.
+    GIF and WebP files repeat forever; all the frames are held in memory while such a file is written. An MP4
+    file plays once and is written frame by frame; if its width or height is odd, the last column or row is
+    repeated.
 
     Args:
         path: Output file, which is written atomically.
@@ -30,7 +30,7 @@ def write_animation(path: str | Path, frames: Iterable[UInt8[np.ndarray, "h w 3"
         frame_ms: Duration of a frame. GIF rounds it to 10 ms.
 
     Raises:
-        StereoweaveError: The extension is none of these, there are no frames, their sizes differ, PyAV is
+        StereoweaveError: The extension is not one of these, there are no frames, their sizes differ, PyAV is
             missing, or the disk is full.
     """
     write = _KINDS[check_animation_ending(path)]

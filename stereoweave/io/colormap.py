@@ -9,7 +9,7 @@ OCCLUDED_RGB = (217, 72, 15)
 
 
 def find_colour_range_px(disparity_px: Float[np.ndarray, "h w"]) -> tuple[float, float]:
-    """Return the disparities, in px, of the first and the last colour.
+    """Return the disparities, in px, that the first and the last colour represent.
 
     The lowest and the highest half percent are ignored, so that a few outliers do not reduce the contrast.
     """
@@ -42,7 +42,7 @@ def colour_confidence(
 
 
 def legend_colours(count: int) -> list[str]:
-    """Return `count` evenly spaced CSS colours, from the low end of the disparity colours to the high end."""
+    """Return `count` CSS colours, evenly spaced from the low end of the disparity colours to the high end."""
     ramp = colour_disparity(np.linspace(0, 1, count, dtype=np.float32)[None], (0.0, 1.0))[0]
     return [css_colour(tuple(rgb)) for rgb in ramp.tolist()]
 

@@ -87,7 +87,7 @@ def read_picture(path: Path) -> DecodedPicture:
 
 
 def decode(path: Path, picture: Image.Image) -> DecodedPicture:
-    """Decode an opened picture, or its current frame."""
+    """Decode an open picture, or the current frame if it has several."""
     with _decoding(path):
         # Load before reading the tags, because loading turns a TIFF upright and updates its orientation tag.
         picture.load()
@@ -100,7 +100,7 @@ def decode(path: Path, picture: Image.Image) -> DecodedPicture:
 
 
 def decode_values(path: str | Path, picture: Image.Image) -> Shaped[np.ndarray, "h w *channels"]:
-    """Decode the stored values of an opened picture, such as measurements or a mask."""
+    """Decode the stored values of an open picture, such as measurements or a mask."""
     with _decoding(path):
         picture.load()
         return np.array(picture)
@@ -262,7 +262,7 @@ def _clean_text(text: str) -> str:
 
 
 def find_view_frames(path: Path, picture: Any) -> list[int]:
-    """Return the indices of an MPO file's two frames that hold its views; empty if it has only one view."""
+    """Return the indices of the two frames that hold an MPO file's views; empty if there is only one view."""
     if picture.format != "MPO":
         return []
     with _decoding(path):

@@ -54,7 +54,7 @@ class Lens:
 
 
 def read_tags(picture: Image.Image) -> Tags:
-    """Read the tags of an opened picture, or of an MPO file's current frame; damaged tags are left out."""
+    """Read the tags of an open picture, or of an MPO file's current frame; damaged tags are left out."""
     # Pillow warns about each damaged tag.
     with warnings.catch_warnings(action="ignore"):
         return _read_exif_tags(picture) | _read_multi_picture_tags(picture.info.get("mp", b""))
@@ -95,7 +95,7 @@ def _read_exif_tags(picture: Image.Image) -> dict[int, Any]:
 
 
 def _read_multi_picture_tags(content: bytes) -> dict[int, Any]:
-    """Read the tags of an MPO file's frame: its own tags and, in the first frame, the file's tags too."""
+    """Read the tags of a frame in an MPO file; for the first frame, these include those of the whole file."""
     tags: dict[int, Any] = {}
     try:
         directory = ImageFileDirectory_v2(content[:8])

@@ -50,9 +50,9 @@ def make_folder(path: str | Path) -> Path:
 
 
 def make_parent_folder(*files: Path) -> Path:
-    """Check that files in one folder can be written. Returns the nearest existing parent folder.
+    """Check that files in the same folder can be written. Returns the nearest existing parent folder.
 
-    That parent is checked in place of folders that do not exist yet. Raises StereoweaveError if a file cannot
+    If the folder does not exist yet, this parent is checked instead. Raises StereoweaveError if a file cannot
     be written.
     """
     for file in files:
@@ -75,7 +75,7 @@ def reading(path: str | Path, expected: str) -> Iterator[None]:
 
 @contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
-    """Write a file atomically: yield a temporary path, whose file replaces `path` at the end.
+    """Write a file atomically: yield a temporary path, then move the file from there to `path`.
 
     The temporary file is in the folder of `path`, has the same extension, and is removed after an error.
     Missing folders are created.
@@ -95,7 +95,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
 
 
 def is_leftover(path: Path) -> bool:
-    """Return whether a file has the name of a temporary file of `replacing`, which a killed program left."""
+    """Return whether a file has the kind of name that `replacing` gives to temporary files."""
     return _TEMPORARY.fullmatch(path.name) is not None
 
 

@@ -1,4 +1,4 @@
-"""Reading and writing of pictures."""
+"""Reading and writing pictures."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,4 +1,4 @@
-"""Reading and writing of disparity, depth and other maps."""
+"""Reading and writing disparity, depth and other maps."""
 
 import math
 import os
@@ -24,7 +24,7 @@ class RangeError(StereoweaveError):
 
 
 def read_pfm(path: str | Path) -> Float32[np.ndarray, "h w"]:
-    """Read a single-channel PFM file of either byte order, top row first.
+    """Read a single-channel PFM file in either byte order, and return the top row first.
 
     Source: Middlebury's variant of the format, with rows from bottom to top and a negative scale for
     little-endian values.

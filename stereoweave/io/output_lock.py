@@ -28,7 +28,7 @@ def lock_output(output: Path, before_waiting: Callable[[], None] | None = None) 
     that does not support locks.
 
     Args:
-        output: An existing folder, or a file, whose folder is created if it is missing.
+        output: An existing folder, or a file. If the file's folder is missing, it is created.
         before_waiting: Function to call before waiting for another process to release the lock; if it is
             None, a locked output is an error.
 

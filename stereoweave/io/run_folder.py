@@ -1,4 +1,4 @@
-"""Claims on output folders: JSON descriptions of the folders' runs, which other runs check before they write.
+"""Claims on output folders: a run leaves a JSON description that later runs check before they write there.
 
 The functions take and return the description's text, so the folder may be on a disk or in a store.
 """
@@ -12,7 +12,7 @@ from stereoweave.errors import FormatError, StereoweaveError
 
 
 def describe_run(facts: Mapping[str, Any]) -> str:
-    """Return a run's metadata as the JSON text of a description, which `parse_description` reads."""
+    """Return a run's metadata as a JSON description that `parse_description` can read."""
     return json.dumps(facts, indent=1, default=str) + "\n"
 
 
@@ -57,7 +57,7 @@ def check_claim(place: str | Path, facts: Mapping[str, Any], found: Mapping[str,
 
 
 def check_unclaimed(folder: str | Path, file: str, others: Iterable[str]) -> None:
-    """Check that a folder without a description has no files.
+    """Check that a folder without a description contains no files.
 
     Args:
         folder: Path or URL of the folder, for the error message.

@@ -1,4 +1,4 @@
-"""One interface to folders on a disk and in object stores (s3://, gs://, az:// and abfs:// through fsspec).
+"""One interface to folders on disk and in object stores (s3://, gs://, az:// and abfs:// through fsspec).
 
 Endpoint, region and keys come from the environment and the provider's own files, such as AWS_ENDPOINT_URL and
 ~/.aws/credentials. The store's library retries requests that fail with "slow down" or a server error.
@@ -25,10 +25,10 @@ class _Kind(NamedTuple):
     """A kind of object store.
 
     Attributes:
-        library: Name of the library.
+        library: Name of the Python library that accesses the store.
         keys: Environment variables for the keys.
         endpoint: Environment variable for the endpoint.
-        settings: Settings of the library.
+        settings: Settings for the library.
     """
 
     library: str
@@ -67,7 +67,7 @@ _VERSIONS = ("ETag", "etag", "md5Hash", "updated", "last_modified")
 
 
 class StoredFile(NamedTuple):
-    """A file in a store: path relative to the folder, separated by "/", size, and version of its content."""
+    """A file in a store. Its path is relative to the folder; its version changes with its content."""
 
     path: str
     size_bytes: int
@@ -78,7 +78,7 @@ class StoredFile(NamedTuple):
 class Store(Protocol):
     """A folder on a disk or in an object store; it can be pickled and connects on first use.
 
-    Paths are relative to the folder and separated by "/".
+    Paths are relative to the folder and use "/" as the separator.
 
     Raises:
         StereoweaveError: The folder is unreachable, the file is missing, or access is denied. Every method
@@ -92,7 +92,7 @@ class Store(Protocol):
 
     @property
     def folder(self) -> Path | None:
-        """Path of a folder on a disk, where files need no `fetch` and no `put`; None for object stores."""
+        """Path of a folder on a disk, where files need neither `fetch` nor `put`; None for object stores."""
         ...
 
     def check_source(self) -> None:
@@ -141,7 +141,7 @@ class Store(Protocol):
 
 
 def store_at(place: str | Path) -> Store:
-    """Return the store of a path or URL, without connecting to it.
+    """Return the store for a path or URL, without connecting to it.
 
     Raises:
         StereoweaveError: The protocol is unknown, its library is missing, or the URL has no bucket.
@@ -293,7 +293,7 @@ class ObjectStore:
         return self.place.startswith("s3://")
 
     def _has_any(self) -> bool:
-        """Return whether the folder contains any objects; an unreachable store fails within seconds."""
+        """Return whether the folder contains objects; raise an error within seconds if it is unreachable."""
         with self._library("", "a folder that can be listed") as (library, folder):
             bucket = folder.partition("/")[0]
             try:
@@ -333,7 +333,7 @@ class ObjectStore:
 
 
 def _list_entries(folder: Path) -> list[os.DirEntry[str]]:
-    """Return a folder's visible entries, sorted by name; empty if the folder is missing or unreadable."""
+    """Return a folder's visible entries, sorted by name; [] if the folder is missing or unreadable."""
     with suppress(FileNotFoundError, PermissionError), os.scandir(folder) as entries:
         return sorted((entry for entry in entries if entry.name[0] != "."), key=lambda entry: entry.name)
     return []
@@ -347,7 +347,7 @@ def _read_status(entry: os.DirEntry[str]) -> os.stat_result | None:
 
 
 def _list_s3(library: "AsyncFileSystem", folder: str) -> Iterator[StoredFile]:
-    """Yield the files below a folder with their full names, fetched lazily in pages of a thousand."""
+    """Yield the files below a folder with their full names, listed lazily in pages of a thousand."""
     bucket = folder.partition("/")[0]
     more: dict[str, Any] | None = {}
     while more is not None:

@@ -1,6 +1,6 @@
 """Safe parsing of YAML, JSON and XML from untrusted files into plain values.
 
-Anchors, aliases and DTDs are refused, custom types are never built, and the nesting and the number of
+Anchors, aliases and DTDs are refused, custom types are never instantiated, and the nesting and the number of
 values are checked before any recursion. The parsing time is proportional to the length of the text, which
 the caller limits.
 """
@@ -157,5 +157,5 @@ def _xml_value(element: ElementTree.Element) -> Any:
 
 
 def _xml_items(text: str) -> list[Any]:
-    """Split a sequence into numbers and words; words that contain spaces are quoted."""
+    """Split the text of a sequence into numbers and words; words that contain spaces are quoted."""
     return [item.strip('"') for item in _XML_ITEM.findall(text)]

@@ -33,7 +33,7 @@ def writing_text(path: str | Path) -> Iterator[TextIO]:
 
 
 def write_table(path: str | Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
-    """Write a CSV file with a header; an apostrophe is put before text that a spreadsheet would compute."""
+    """Write a CSV file with a header; text that a spreadsheet would evaluate gets a leading apostrophe."""
     with writing_text(path) as file:
         writer = csv.DictWriter(file, columns)
         writer.writeheader()
@@ -47,5 +47,5 @@ def _escape_formulas(value: Any) -> Any:
 
 
 def _is_computed(cell: str) -> bool:
-    """Return whether a cell begins like a formula, even with a full-width sign (＝) or leading blanks."""
+    """Return whether a cell begins like a formula, even with a full-width sign (＝) or leading spaces."""
     return cell.startswith(_COMPUTED) or unicodedata.normalize("NFKC", cell).lstrip().startswith(_COMPUTED)

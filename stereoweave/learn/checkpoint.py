@@ -26,7 +26,7 @@ class Checkpoint:
         random_state: PyTorch's random state. All other random numbers depend only on (seed, step).
         scores: Scores of the last validation.
         commit: Commit of the code that trained the network.
-        hours: Training time so far, including restarts and the runs that this run descends from.
+        hours: Hours of training so far, over all restarts and including the runs that this run descends from.
         origin: Recipe, step and commit of each checkpoint that the run descends from, oldest first.
     """
 
@@ -99,7 +99,7 @@ def strip_to_average(kept: Checkpoint) -> Checkpoint:
 
 
 def average(first: Checkpoint, second: Checkpoint, start: Checkpoint) -> Checkpoint:
-    """Average two runs that started from `start`. A further run can start from the result.
+    """Average the weights of two runs that started from `start`, as a starting point for a further run.
 
     The mean of two networks fine-tuned from the same weights is often better than either (Wortsman et al.,
     "Model soups", ICML 2022). Running variances are averaged too.
@@ -167,7 +167,7 @@ def load(path: Path) -> Checkpoint:
 
 
 def find_commit() -> str:
-    """Return the commit of the running code, with a '+' if files differ; 'unknown' outside a repository."""
+    """Return the code's commit, with a '+' for uncommitted changes; 'unknown' outside a repository."""
     try:
         # Only in this package's own repository: an installed package may lie inside an unrelated one.
         described = subprocess.run(

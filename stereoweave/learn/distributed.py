@@ -54,7 +54,7 @@ def report_once() -> Iterator[None]:
 def choose_thread_count() -> int | None:
     """Return this process's number of threads, an equal share of the cores; None for PyTorch's default.
 
-    The result is None in a single process, and if OMP_NUM_THREADS is above 1. A value of 1 does not count as
+    The result is None in a single process, or if OMP_NUM_THREADS is above 1. A value of 1 does not count as
     the user's choice, because torchrun sets it by default on any machine.
     """
     here = read_rank().local_world_size

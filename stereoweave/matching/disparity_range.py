@@ -53,8 +53,8 @@ def find_range(pair: StereoPair) -> tuple[float, float] | None:
     """Return the least and the greatest disparity of the left view in px; either may be negative.
 
     The greatest disparity includes a margin for nearer surfaces without matches. The least disparity has no
-    margin, because a network assigns the lower end of its range to a plain sky. If the least disparity is
-    5 px too low, a rendered ship has twice as many wrong pixels.
+    margin, because a network assigns the lower end of its range to a plain sky. In a rendered scene with a
+    ship, a least disparity 5 px too low doubled the number of wrong pixels.
 
     Pixels without content are ignored. Returns None if there are too few matches, as in plain images or
     images of different scenes.

@@ -110,7 +110,7 @@ def match(matcher: Matcher, pair: StereoPair, options: MatchOptions = DEFAULT_OP
             larger pairs are upsampled even if `raw` is set.
 
     Raises:
-        StereoweaveError: The disparity range is outside the images' width, or a side is shorter than 32 px.
+        StereoweaveError: The disparity range lies beyond the images' width, or a side is shorter than 32 px.
     """
     (found,) = match_many(matcher, [pair], options)
     return found

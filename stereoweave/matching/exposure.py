@@ -107,11 +107,11 @@ def recolour(
 def match_exposure(
     left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"], estimate: Estimate
 ) -> Looks | None:
-    """Fit the correspondence of levels; return None if the images agree or too few pixels match.
+    """Fit the level correspondence; return None if the images agree or too few pixels match.
 
     Smooth curves equalise the histograms of reliably matched pixels, because small disparity errors swap
     neighbouring pixels but hardly change histograms. The correction fades out as the mean difference
-    approaches the level caused by noise and lenses alone.
+    approaches what noise and lenses alone would cause.
 
     Args:
         left: Left image, uint8 RGB [H, W, 3].

@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
 OCCLUSION_STEP_PX = 1.0
-"""Tolerance for matching errors: a pixel is occluded if the surface at its match is nearer by more."""
+"""Matching tolerance: a pixel is occluded if the surface at its match is nearer by more than this."""
 # Number of rows checked at once, because checking all of a 50-megapixel image would take another gigabyte.
 _BAND_ROWS = 256
 
@@ -24,7 +24,7 @@ def find_occluded(
 def measure_disagreement(
     disparity_px: Float[np.ndarray, "h w"], right_disparity_px: Float[np.ndarray, "h w"]
 ) -> tuple[Float[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """Return the views' disagreement in px at each left pixel, and the mask of matches in the right image.
+    """Return the views' disagreement in px at each left pixel, and whether its match is in the right image.
 
     The disagreement is the right disparity at the pixel's match minus the pixel's own disparity.
     """
@@ -42,7 +42,7 @@ def is_occluded(
 def at_match(
     values: Shaped[np.ndarray, "h w"], disparity_px: Float[np.ndarray, "h w"], direction: int
 ) -> tuple[Shaped[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """Return the other view's value at each pixel's match, and the mask of matches inside the other image.
+    """Return the other view's value at each pixel's match, and whether the match is inside the other image.
 
     Matches outside the other image get the value of its border column.
 

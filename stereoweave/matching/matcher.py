@@ -288,7 +288,7 @@ class Matcher:
     def _borders_px(self, height: int, width: int) -> list[tuple[int, int]]:
         """Return the padding (above, below) and (left, right) up to the network's input size.
 
-        Opposite sides get half each, because padding one side only would harm one view more than the other.
+        The padding is split evenly, because padding one side only would harm one view more than the other.
         """
         rows, columns = self._run_size(height, width)
         return [(px // 2, px - px // 2) for px in (rows - height, columns - width)]
@@ -413,13 +413,13 @@ def _confidence(
 
     A pixel's match cannot be farther than the pixel itself, because both cameras see the nearest surface.
     Where the right view's disparity contradicts this, one of the two views is wrong, and the network's
-    probability is halved. On collages and real pairs, about a quarter of such pixels are right, while the
+    probability is halved. On collages and real pairs, about a quarter of such pixels are correct, while the
     network claims a probability of 0.4 to 0.5. The confidence is 0 where the left image is plain.
 
     Args:
         logit: The network's log odds; None if the network has no such output.
         disagreement_px: The right view's disparity at the match minus the left view's disparity.
-        inside: Mask of matches inside the right image.
+        inside: Mask of left pixels whose match is inside the right image.
         plain: Mask of left pixels without texture to match.
     """
     if logit is None:

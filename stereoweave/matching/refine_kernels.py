@@ -15,11 +15,11 @@ from stereoweave.system.jit import inlined, kernel
 SUBSTEPS = 8
 """Number of steps per px in which a candidate's distance to the network's disparity is measured."""
 DOUBTLESS, FARTHEST = np.uint16(SUBSTEPS), np.uint16(8 * SUBSTEPS)
-"""Distance to the network's disparity up to which the cost is 0, and the excess at which it is greatest."""
+"""The cost is 0 up to the first distance from the network's disparity, and grows over the second."""
 MOST_TRUST = 12
 """Greatest cost of the distance to the network's disparity, reached at confidence 1."""
 MOST_DIFFERENCE = np.uint8(40)
-"""Upper limit of a channel's difference, because all greater differences mean a different surface."""
+"""Upper limit of a channel's difference, because any greater difference means a different surface."""
 SMALL_STEP = 20
 """Penalty for a disparity step of one candidate between two pixels of a path."""
 PRECISE_PX = 1.5
@@ -31,7 +31,7 @@ AGREED_PX = 1.0
 RELIABLE_RUN = 8
 SLACK_PX = 2
 LARGEST_MOVE_PX = 24
-"""A network's disparity at the border that differs by more than this belongs to another surface."""
+"""Border disparities that differ from the surface's by more than this belong to another surface."""
 _CENSUS_RADIUS = 2
 _NEVER = np.uint16(30000)
 _SIX = np.uint16(6)
@@ -269,7 +269,7 @@ def pick(sums, first_px, first, last, found_px):
 @kernel
 @typing.no_type_check
 def settle(found_px, other_px, trust, towards, disparity_px, agreed):
-    """Write the mask of pixels at which both views agree into agreed, and replace their disparities.
+    """Write to agreed the mask of pixels at which both views agree, and replace their disparities.
 
     The network's disparity is kept if its confidence `trust` is at least CERTAIN, or if it differs by at
     most PRECISE_PX. towards is -1 if the match of column x is at x - disparity, and 1 if it is at
@@ -289,7 +289,7 @@ def settle(found_px, other_px, trust, towards, disparity_px, agreed):
 @kernel
 @typing.no_type_check
 def extend(agreed, trust, towards, disparity_px):
-    """Extend the first surface of each row to the image border, which the other camera does not see.
+    """Extend each row's first surface to the image border, over pixels that the other camera does not see.
 
     A surface is a run of RELIABLE_RUN pixels at which both views agree. It is extended if the matches of all
     pixels between the surface and the border are outside the other image. Disparities that are certain, or

@@ -19,7 +19,7 @@ MIDDLE = 8
 SMALL_STEP = 12
 """Penalty for a disparity step of one candidate between two pixels of a path."""
 MOST_DIFFERENCE = np.uint8(40)
-"""Upper limit of the grey difference, because all greater differences mean a different surface."""
+"""Upper limit of the grey difference, because any greater difference means a different surface."""
 AGREED_PX = 1.0
 """Greatest difference at which the two views' disparities agree."""
 FILL_PX = 8.0

@@ -24,7 +24,7 @@ _MOST_CONFIDENT = 0.9995
 
 @dataclass(frozen=True, kw_only=True)
 class CameraError:
-    """Relative uncertainties of the focal length and the baseline; 0.01 is 1 %."""
+    """Relative uncertainties of the focal length and the baseline; 0.01 means 1 %."""
 
     focal: float = 0.0
     baseline: float = 0.0
@@ -83,7 +83,7 @@ def distance(
         camera: The pair's camera.
         first_px: Column and row of a pixel in the left image.
         second_px: Column and row of another pixel.
-        camera_error: Relative uncertainty of the camera.
+        camera_error: Relative uncertainties of the focal length and the baseline.
 
     Raises:
         StereoweaveError: A pixel is outside the image, its depth is unknown or infinite, or the two pixels
@@ -139,7 +139,7 @@ def _find_point_m(
 
 
 def _check_pixel(estimate: Estimate, pixel_px: tuple[int, int]) -> tuple[int, int]:
-    """Return a pixel's column and row.
+    """Check that a pixel can be measured, and return its column and row.
 
     Raises:
         StereoweaveError: The pixel is outside the image, is occluded or has a low confidence.

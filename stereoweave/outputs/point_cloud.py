@@ -70,7 +70,7 @@ def make_point_cloud(
         pair: The pair, with its camera.
         estimate: The pair's estimate.
         least_confidence: Lowest confidence of a pixel to use.
-        most_points: Largest number of points. If there are more, only every nth row and every nth column
+        most_points: Maximum number of points. If there are more, only every nth row and every nth column
             are used.
 
     Raises:
@@ -85,7 +85,7 @@ def make_point_cloud(
 def make_mesh(
     pair: StereoPair, estimate: Estimate, *, least_confidence: float = 0.5, most_points: int = MOST_POINTS
 ) -> Mesh:
-    """Return the mesh through the points of `make_point_cloud`, open at depth edges.
+    """Return the mesh through the points of `make_point_cloud`, with gaps at depth edges.
 
     The arguments and errors are those of `make_point_cloud`. Neighbouring pixels are joined unless their
     disparities differ by more than 1 px per pixel. Points that no triangle uses are removed.
@@ -193,7 +193,7 @@ def _place_points(
     places: Int[np.ndarray, "n 2"],
     step_px: int,
 ) -> PointCloud:
-    """Return the point cloud of the pixels that are given by their rows and columns."""
+    """Return the point cloud of the pixels at the given rows and columns."""
     rows, columns = places.T
     depth_m = camera.depth_m(estimate.disparity_px[rows, columns][None])[0]
     x, y = (columns - camera.cx_px) / camera.focal_px, (rows - camera.cy_px) / camera.focal_px
@@ -206,7 +206,7 @@ def _triangulate(
 ) -> Int[np.ndarray, "m 3"]:
     """Return up to two triangles per square of pixels.
 
-    The depth of all three corners is known, and their disparities differ by at most `most_px`.
+    In each triangle, all three corners have known depth, and their disparities differ by at most `most_px`.
     """
     number = np.cumsum(known).reshape(known.shape) - 1
     here, right, below, across = np.s_[:-1, :-1], np.s_[:-1, 1:], np.s_[1:, :-1], np.s_[1:, 1:]

@@ -179,7 +179,7 @@ def _resize_nearest(values: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 
 def _encode_disparity(estimate: Estimate) -> dict[str, object]:
-    """Encode the disparities that are shown at the pointer as low_px + step_px * level.
+    """Encode the disparities that are shown beside the mouse pointer, as low_px + step_px * level.
 
     The levels have 16 bits and are encoded in base64.
     """
@@ -200,7 +200,7 @@ def _encode_disparity(estimate: Estimate) -> dict[str, object]:
 
 
 def _list_numbers(summary: Summary) -> list[tuple[str, str]]:
-    """Return the rows of the summary table, each of which is a name and a value with its unit."""
+    """Return the rows of the summary table: a name, and a value with its unit, in each row."""
     rows = [
         ("Size", f"{summary.width_px} × {summary.height_px} px"),
         ("Model", summary.model),
@@ -236,7 +236,7 @@ def _label_ticks(range_px: tuple[float, float], camera: StereoCamera | None) -> 
 
 
 def _depth_m(camera: StereoCamera | None, disparity_px: float) -> float | None:
-    """Return the depth of a disparity in metres; None if it is infinite or the camera is unknown."""
+    """Return the depth for a disparity, in metres; None if the depth is infinite or the camera is unknown."""
     if camera is None:
         return None
     depth_m = float(camera.depth_m(np.array([[disparity_px]], np.float64))[0, 0])

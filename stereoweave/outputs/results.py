@@ -107,7 +107,7 @@ class DepthJob:
 
 
 def make_depth(pictures: Sequence[Path], out: Path, job: DepthJob) -> tuple[Summary, list[Note]]:
-    """Write all results of a pair to `out` atomically. Returns the summary and user-facing notes."""
+    """Write all the results for a pair to `out` atomically. Returns the summary and user-facing notes."""
     matcher = job.backend.matcher()
     prepared = prepare(pictures, job.request)
     files, left_out = _choose_files(job, prepared.pair)
@@ -170,7 +170,7 @@ def _choose_files(job: DepthJob, pair: StereoPair) -> tuple[list[str], list[Note
 
 @contextmanager
 def _write_together(out: Path) -> Iterator[Path]:
-    """Yield a temporary folder whose files move to `out` at the end; an error leaves `out` unchanged.
+    """Yield a temporary folder whose files are moved to `out` at the end; an error leaves `out` unchanged.
 
     Files of an earlier result that the new result lacks are removed, so that all output files in `out` belong
     to the same result. An earlier result is recognised by disparity.pfm, which every result has and which is
@@ -192,7 +192,7 @@ def _write_together(out: Path) -> Iterator[Path]:
 
 
 def write_files(folder: Path, files: Sequence[str], result: Result) -> list[Note]:
-    """Write output files of a result. Returns a note for each file that is skipped or thinned."""
+    """Write the given output files of a result. Returns a note for each file that is skipped or thinned."""
     notes = []
     for file in files:
         try:

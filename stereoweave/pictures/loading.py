@@ -143,7 +143,7 @@ def _open_one(path: Path, format: str | None) -> Opened:
 
 
 def _open_mpo(path: Path, picture: Image.Image, frames: Sequence[int]) -> Opened:
-    """Open the pair in an MPO file; both have the first picture's orientation, as one camera took them."""
+    """Open the pair in an MPO file; both get the first picture's orientation, as one camera took both."""
     decoded = [read_frame(path, picture, index) for index in frames]
     lies = exif.read_orientation(decoded[0].tags)
     # CIPA DC-007 numbers viewpoints from the left; many files omit the number and store the left view first.
@@ -201,10 +201,10 @@ def _compare(left: DecodedPicture, right: DecodedPicture, lies: tuple[int | None
 
 
 def _read_declared(path: Path, picture: Image.Image, format: str | None) -> tuple[str | None, str | None]:
-    """Return the layout that the user or a JPS file declares, and where it was found unless the user gave it.
+    """Return the layout that the user or a JPS file declares, and a phrase such as "from its JPS header".
 
-    Both are None if no layout is declared. Source: VRex's JPS format, in which four bytes follow the
-    identifier and the length: separation, flags, layout and type.
+    The phrase is None if the user gave the layout; both are None if none is declared. Source: VRex's JPS
+    format, in which four bytes follow the identifier and the length: separation, flags, layout and type.
     """
     if format not in (None, "jps"):
         return format, None

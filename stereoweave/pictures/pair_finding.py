@@ -1,4 +1,4 @@
-"""Finding the pairs of a batch, in a folder, by two glob patterns or in a list, and naming them."""
+"""Finding and naming the pairs of a batch: in a folder, by two glob patterns, or from a list."""
 
 import csv
 import glob
@@ -73,7 +73,7 @@ class ListedPair(NamedTuple):
 
 
 class Listed(NamedTuple):
-    """Pairs, videos, and pictures without a partner among listed files."""
+    """Pairs, videos and unpaired pictures among listed files."""
 
     pairs: list[ListedPair]
     films: list[ListedPair]
@@ -146,9 +146,9 @@ def find_pairs_in(folder: Path) -> FoundPairs:
 def find_pairs_among(folder: str | Path, paths: Iterable[str]) -> Listed:
     """Find the pairs and videos among the files of a folder.
 
-    Two pictures are a pair if their paths differ only in the marks of left and right: left/a.png and
+    Two pictures are a pair if their paths differ only in their left/right marks: left/a.png and
     right/a.png, a_L.png and a_R.png, left_01.png and right_01.png, im0.png and im1.png. If one picture is
-    missing, the pair is listed nevertheless and fails when it is read. A file with both views is also a pair.
+    missing, the pair is still listed, and fails when it is read. A file with both views is also a pair.
     If there is no such pair or file, every picture is taken to hold both views. A calib.txt beside left.png
     or im0.png belongs to that pair. Output folders of batches are ignored.
 
@@ -378,7 +378,7 @@ def _strip_marks(part: str) -> str:
 
 
 def _sanitize(name: str) -> str:
-    """Return a name that is valid for a folder on every system and differs from a batch's own files."""
+    """Return a name that is valid for a folder on every system and not taken by a batch's own files."""
     name = _NOT_IN_NAMES.sub("_", name).strip(" .") or "pair"
     return f"{name}_" if _TAKEN.fullmatch(name) else name
 

@@ -101,8 +101,8 @@ def detect_layout(
 ) -> str:
     """Detect a video's layout, a name in `PAIR_LAYOUTS`, from its container, its name or its frames.
 
-    The frames must confirm a layout in the name, unless they are too plain, because "LR" has other meanings
-    too. The frames do not show which view comes first; the left view is taken to be first, unless the
+    Because "LR" has other meanings too, the frames must confirm a layout found in the name, unless they are
+    too plain. The frames do not show which view comes first; the left view is taken to be first, unless the
     container or the name says otherwise.
 
     Args:
@@ -110,7 +110,7 @@ def detect_layout(
         frames: Some frames of the video, far apart in time.
         declared: Layout that the container declares, a full-size name in `PAIR_LAYOUTS`; the views may
             nevertheless be half size.
-        photograph: Whether the file is a still picture, which may be upright, rather than a video.
+        photograph: Whether the file is a still picture, not a video; its views may be in portrait format.
 
     Raises:
         FormatError: The halves of the frames do not resemble each other, side by side or one above the other;

@@ -108,7 +108,7 @@ def _find_camera(
 
 
 def _rectify_by_features(ready: Rectified) -> Rectified:
-    """Rectify the pair from feature matches and drop its camera, as disparity at infinity is then unknown."""
+    """Rectify the pair from feature matches; drop its camera, as disparity at infinity is then unknown."""
     rectified = rectify_by_features(ready.pair)
     if ready.pair.camera is None:
         return rectified

@@ -1,8 +1,8 @@
 """Kernels that continue an image's background behind its foreground, with texture.
 
 The hidden background is synthesised once per image rather than once per view, so that it is consistent
-between views. From every depth edge, the farther surface continues as far as a camera within one baseline can
-look behind the edge. Each hidden pixel copies the pixel of that surface whose neighbourhood is most similar.
+between views. At every depth edge, the farther surface is continued as far behind the edge as a camera within
+one baseline can see. Each hidden pixel copies the pixel of that surface whose neighbourhood is most similar.
 The candidates lie next to the pixels from which the hidden pixel's neighbours were copied (Ashikhmin 2001,
 "Synthesizing natural textures").
 """

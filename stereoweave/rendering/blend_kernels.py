@@ -8,16 +8,16 @@ from stereoweave.rendering.canvas_kernels import NOTHING, SAME_SURFACE_PX, suppo
 from stereoweave.system.jit import compiled, inlined
 
 RIM = 0.15
-"""Largest support for a surface that appears in one image only, and only in impure pixels."""
+"""A pixel is pure if its support exceeds this, which impure pixels of one image alone cannot reach."""
 
 WINDOW_REACH_PX = 2
-"""Reach of the alignment window, which has 5x5 pixels, from its centre."""
+"""Radius of the alignment window, which is 5x5 pixels in size."""
 LARGEST_STEP_PX = np.float32(1)
 """Largest change that the alignment makes to a disparity."""
 FLAT_LEVELS2 = np.float32(30)
 """Regularisation: mean squared grey-level slope below which a window is too flat to align."""
 DOUBLES_REACH_PX = 12
-"""A doubled object is thin: on both sides, there are pixels within this distance that are not doubled."""
+"""A doubled object is thin: both sides have pixels within this distance that are not doubled."""
 AGREED_LEVELS = 30
 """The images agree where their difference, summed over the channels, is at most this."""
 ALIKE_LEVELS, UNLIKE_LEVELS = 20, 60

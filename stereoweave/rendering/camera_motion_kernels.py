@@ -18,7 +18,7 @@ def move(image, surface_px, drawn, targets, disparity_px, canvas):
     """Move each pixel (y, x) to the fractional column targets[y, x] of the canvas; the nearest surface wins.
 
     Colours are interpolated between neighbours on the same surface, so that magnified surfaces have no
-    cracks. Pixels on which nothing lands stay impure.
+    cracks. `pure` stays False where nothing lands.
 
     Args:
         image: uint8 RGB [H, W, 3].

@@ -51,9 +51,9 @@ def _mix(hidden_px, colours, x, beyond, colour):
 @kernel
 @typing.no_type_check
 def fill(canvas):
-    """Fill each run of pixels that are still impure from the farther of the two surfaces beside the run.
+    """Fill each remaining run of impure pixels from the farther of the two surfaces beside it.
 
-    A narrow run gets the surface's mean colour, because this has the least error. A wide run gets the
+    A narrow run gets the surface's mean colour, which gives the least error. A wide run gets the
     surface's mirrored texture, and so does a run at the image border, which has a surface on one side only.
     As in `paint_background`, impure pixels farther away than that surface keep their colour.
     """
@@ -85,7 +85,7 @@ def fill(canvas):
 def _average_beside(canvas, y, column, inwards):
     """Return the mean colour of the surface at (y, column).
 
-    The mean is taken over two columns and three rows, where row y counts twice.
+    The mean is taken over two columns and three rows, with row y counted twice.
     """
     height, width = canvas.pure.shape
     here_px = canvas.surface_px[y, column]

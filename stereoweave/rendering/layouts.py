@@ -63,7 +63,7 @@ class LayoutOptions:
     """Options of a layout.
 
     Attributes:
-        columns, rows: Numbers of columns and of rows of views in a quilt.
+        columns, rows: Number of columns and rows of views in a quilt.
         range_px: Disparities shown as black and as white in rgbd; default: the image's own range. A video
             uses one range for all frames, to avoid flicker.
     """

@@ -242,7 +242,7 @@ def _recolour(
 def _assume_camera(estimate: Estimate) -> StereoCamera:
     """Return a camera with a horizontal field of view of 53 degrees and a centred principal point.
 
-    Negative disparities mean that the cameras converge; the lowest ones are then taken as infinitely far.
+    Negative disparities mean that the cameras converge; the lowest ones are then taken to be at infinity.
     """
     height, width = estimate.disparity_px.shape
     return StereoCamera(

@@ -25,7 +25,7 @@ class BusyError(StereoweaveError):
 
 
 class Budget:
-    """Accepted work of one process, and the time that the process takes per unit of work.
+    """The work that one process has accepted, and the time that it takes per unit of work.
 
     A request is refused permanently if it could not finish in time even at the best speed so far. It is
     refused temporarily if, at the median of recent speeds, it would be late after all accepted requests.

@@ -81,9 +81,9 @@ class Limits(BaseModel):
     Attributes:
         megabytes: Maximum size of a whole request.
         megapixels: Maximum size of each view of a pair.
-        timeout_s: Maximum time from the header of a request to the header of its response.
+        timeout_s: Maximum time from the arrival of a request's header to the start of the response.
         waiting: Maximum number of pending requests; further requests are refused.
-        hosts: Allowed values of the header Host; None allows all values.
+        hosts: Allowed values of the Host header; None allows all values.
         token: Bearer token that every request except those to /health must contain; None for no token.
     """
 
@@ -258,7 +258,7 @@ class _Metrics:
 
 
 class Guard:
-    """Middleware that checks tokens, and limits the number, size, type and time of POST requests.
+    """Middleware that checks tokens, and limits the number, size, content type and duration of POST requests.
 
     If there is a registry for metrics, the guard also counts and times POST requests.
     """

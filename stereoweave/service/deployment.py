@@ -300,7 +300,7 @@ def _stop_replicas() -> None:
 
 
 def _check_slots(settings: Settings, found: int) -> None:
-    """Raise an error if the replicas do not fit, because Ray would silently wait for more room."""
+    """Raise an error if the replicas do not fit, because Ray would otherwise wait silently for more room."""
     if settings.replicas > found:
         gpu = " and a GPU" if settings.gpus_each else ""
         raise StereoweaveError(

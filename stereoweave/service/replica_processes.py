@@ -1,4 +1,4 @@
-"""Child processes of a replica, which match pictures and are replaced after a timeout or a crash."""
+"""Child processes in which a replica matches pictures; they are replaced after a timeout or a crash."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -48,7 +48,7 @@ class ReplicaProcesses:
         self._answerer.close()
 
     def warm_up(self) -> float:
-        """Compile all kernels, and return the time in seconds per megapixel for an unrefined disparity.
+        """Compile all kernels, and return the time in seconds per megapixel for an unrefined disparity map.
 
         Raises:
             MatcherError: If the network cannot be loaded.

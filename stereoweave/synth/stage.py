@@ -15,7 +15,7 @@ class Stage:
         world: Everything that the cameras see.
         orbit: Range of the viewpoints.
         nearest_px: Range of the nearest surface's disparity in an image 640 px wide.
-        noise_levels: Standard deviation of sensor noise on white, in grey levels (0..255).
+        noise_levels: Standard deviation of the sensor noise in white areas, in grey levels (0..255).
     """
 
     world: World
@@ -26,7 +26,7 @@ class Stage:
 
 @dataclass
 class Palette:
-    """The materials of a scene under construction."""
+    """The materials of a scene that is being built."""
 
     materials: list[Material] = field(default_factory=list)
 

@@ -38,11 +38,11 @@ class Orbit:
 
     Attributes:
         centre_m: Centre of the orbit; the cameras look at a point near it.
-        distance_m: Least and greatest distance from the centre.
-        azimuth_deg: Least and greatest azimuth around z, measured from x towards y.
-        elevation_deg: Least and greatest elevation above the horizon.
-        aim_m: Greatest distance from the centre to the point that the cameras look at.
-        floor_m: Least z of the point midway between the cameras.
+        distance_m: Minimum and maximum distance from the centre.
+        azimuth_deg: Minimum and maximum azimuth around z, measured from x towards y.
+        elevation_deg: Minimum and maximum elevation above the horizon.
+        aim_m: Maximum distance from the centre to the point that the cameras look at.
+        floor_m: Minimum z of the midpoint between the cameras.
     """
 
     centre_m: tuple[float, float, float]

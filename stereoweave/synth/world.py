@@ -14,7 +14,7 @@ class Mesh:
     """Triangles that share no vertices, so neighbours may differ in normals and texture coordinates.
 
     Attributes:
-        corners_m: float32 [N, 3, 3]: triangle, corner, (x, y, z); counter-clockwise when seen from outside.
+        corners_m: float32 [N, 3, 3], indexed by triangle, corner and axis; counter-clockwise from outside.
         normals: float32 [N, 3, 3], outward unit vectors.
         uv_m: float32 [N, 3, 2], texture coordinates in metres along the surface.
         material: int32 [N], index into the world's materials.
@@ -87,8 +87,8 @@ class Sky:
     Attributes:
         sun: Unit vector towards the sun.
         sun_light: The sun's colour and strength; (0, 0, 0) indoors.
-        zenith, horizon, ground: Colours of the sky's gradient, which is visible and lights surfaces from
-            above, from the side and from below.
+        zenith, horizon, ground: Colours of the visible sky's gradient; they also light surfaces from above,
+            from the side and from below.
         cloud_variant: Index of the cloud texture in the family "sky".
         clouds: Cloud cover, from 0 (clear) to 1 (overcast).
     """

@@ -1,4 +1,4 @@
-"""Functions in child processes, which can be killed in the middle of a call and replaced."""
+"""Run functions in child processes that can be killed in mid-call and replaced."""
 
 import os
 import pickle
@@ -82,7 +82,7 @@ class ChildProcess:
         self._started = self._exchanges.submit(_exchange, self._process, self._make)
 
     def _make_folder(self) -> None:
-        """Make the folder if it is missing, because cleaners of /tmp remove folders unused for days."""
+        """Make the folder if it is missing: clean-up jobs delete folders in /tmp that are unused for days."""
         self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
 
     def _open(self, reply: Future[_Reply]) -> Any:
@@ -125,7 +125,7 @@ def _exchange(process: Any, message: bytes) -> _Reply:
 
 
 def _work() -> None:
-    """Make the function, then call it with each message from standard input; this never returns."""
+    """Make the function, then call it with each message from standard input; never return."""
     replies = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # keep libraries' output out of the replies
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the process group; the parent handles it

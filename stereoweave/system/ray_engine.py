@@ -189,7 +189,7 @@ class _LostMachineError(Exception):
 def _run_tasks(
     make_worker: Callable[[], Callable[[TaskT], ResultT]], tasks: dict[int, TaskT], engine: Engine
 ) -> Iterator[tuple[int, ResultT]]:
-    """Yield the number and the result of each task as it finishes.
+    """Yield each task's number and result as soon as the task finishes.
 
     Raises:
         StereoweaveError: A worker raised one, or the workers failed.
@@ -369,7 +369,7 @@ def _check_head(address: str) -> None:
 
 
 def _check_port(address: str) -> None:
-    """Raise a StereoweaveError if the address is malformed, or an OSError if nothing listens at it."""
+    """Raise a StereoweaveError if the address is malformed, or an OSError if nothing is listening there."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if not (host and port.isdigit() and 0 < int(port) < 65536):
         raise StereoweaveError(

@@ -43,7 +43,7 @@ PACKINGS = {
 
 @dataclass
 class VideoTally:
-    """Numbers of frames, cuts and frames with problems so far, and descriptions of the first problems."""
+    """Counts of frames, cuts and frames with problems so far, and descriptions of the first problems."""
 
     frames: int = 0
     cuts: int = 0
@@ -115,7 +115,7 @@ def convert_video(
 
 
 class _FrameConverter:
-    """Converter of frames to output images, with a state that can be saved and restored."""
+    """Converter from frames to output images, whose state can be saved and restored."""
 
     def __init__(self, job: VideoJob, matcher: Matcher, survey: Survey) -> None:
         self.survey, self.tally = survey, VideoTally()

@@ -30,7 +30,7 @@ class VideoJob:
         depth16: Output the left disparity as 16-bit grey, px * 256 as in disparity.png. Values are clipped to
             the range from 1/256 to 255.99 px.
         position: Output the view from this position, where 0 is the left camera and 1 the right one.
-        layout: Output the layout of this name in `LAYOUTS`.
+        layout: Output the layout with this name in `LAYOUTS`.
         strength: Factor by which the baseline is multiplied.
         convergence_px: Disparity of the points that stay in the same column in all views. Default: the median
             disparity of the scene for layouts that overlay their views, 0 for all others.
@@ -117,7 +117,7 @@ class VideoJob:
         return self.name_of(setting) or setting
 
     def find_losses(self, survey: Survey) -> list[Note]:
-        """Return a note if the output format cannot represent all disparities in the video."""
+        """Return a list that contains a note if the output format cannot represent all disparities."""
         low_px, high_px = survey.range_px
         if not self.depth16 or (low_px >= 0 and high_px <= _MOST_GREY16_PX):
             return []

@@ -1,4 +1,4 @@
-"""Reading of stereo videos as pairs of frames with times, for all supported frame packings."""
+"""Reading of stereo videos as timed pairs of frames, for all supported frame packings."""
 
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
@@ -63,7 +63,7 @@ class StereoVideo:
         self.sound = next((track.sound for track in tracks if track.sound), None)
 
     def frames(self, start: int = 0) -> Iterator[StereoFrame]:
-        """Yield the frames from number `start` on, exactly as if all frames had been read.
+        """Yield the frames from number `start` on, the same as if reading had begun at the first frame.
 
         A frame that cannot be decoded is replaced by the last decoded frame. The frames that depend on the
         missing frame, up to the next key frame, are yielded as decoded. In both cases, the frame's `problem`
@@ -112,7 +112,7 @@ def open_video(
 
     Raises:
         FormatError: A file cannot be read, is not 3-D, does not match the other file, or has frames that
-            cannot be halved.
+            cannot be split into two equal halves.
         StereoweaveError: The frame packing is unknown, the number of paths is not one or two, a rate is given
             for a video, or PyAV is missing.
     """

@@ -78,7 +78,7 @@ def _find_match_range_px(
 
 
 def _spread_evenly(count: int, wanted: int) -> range:
-    """Return the numbers of at most `wanted` frames, spread evenly over `count` frames."""
+    """Return the indices of at most `wanted` frames, spread evenly over `count` frames."""
     step = -(-count // wanted)
     return range(step // 2, count, step)
 
@@ -95,7 +95,7 @@ def _add_time(time: Fraction, note: Note, video: StereoVideo) -> Note:
 
 
 def _select_common_notes(defects: Sequence[list[Note]]) -> list[Note]:
-    """Return the notes on the last frame that has notes, if more than half of the frames have notes.
+    """Return the notes on the last frame with notes if over half of the frames have notes; otherwise none.
 
     Notes on fewer frames are unreliable, because a video may begin with black frames.
     """

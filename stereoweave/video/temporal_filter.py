@@ -4,9 +4,9 @@ Each view is filtered separately. The previous estimate is warped along the opti
 disparity that a pixel shares with its neighbourhood is treated as a true change in distance, and the rest as
 noise. Each pixel becomes the mean over the frames that saw its point.
 
-A pixel restarts if the previous frame does not explain the image, or if the new disparity contradicts the old
-one. Near anything that moves in either view, one contradiction suffices; where everything is at rest, the
-majority of frames decides. Moving objects therefore leave no trail.
+A pixel's mean restarts if the previous frame does not explain the image, or if the new disparity contradicts
+the old one. Near anything that moves in either view, one contradiction suffices; where everything is at rest,
+the majority of frames decides. Moving objects therefore leave no trail.
 """
 
 import typing
@@ -25,7 +25,7 @@ from stereoweave.system.threads import thread_count
 MOST_FRAMES = 12.0
 """Maximum number of frames in a mean. The limit lets the mean follow slow changes."""
 SAME_PX, SAME_SHARE = 1.0, 0.02
-"""Two frames show one surface if their disparities differ by at most SAME_PX + SAME_SHARE * disparity."""
+"""Frames show the same surface if their disparities differ by at most SAME_PX + SAME_SHARE * disparity."""
 NEIGHBOUR_PX = 3.0
 """Neighbours belong to the same surface if their disparities differ by less than this."""
 STEP_PX, STEPS = 8, 2
@@ -299,7 +299,7 @@ def _find_calm_matches(
 
 
 def _is_contradicted(new_tracks: list[Track], expected: list[Expectation]) -> bool:
-    """Return whether the new disparity contradicts most known pixels at rest, as tested on a sample."""
+    """Return whether the new disparity contradicts most known pixels at rest, judging by a sample."""
     asked, contradicted = [], []
     for new, (carried, calm, drift_px) in zip(new_tracks, expected, strict=True):
         new_px, old_px, frames = (
@@ -324,8 +324,8 @@ def _update(new: Track, expected: Expectation) -> Track:
 def carry(new_px, track, motion, carried):
     """Warp `track` to the new frame and write it to `carried`, with 0 frames where nothing is known.
 
-    Motion is not accurate to the pixel. Outside calm areas, each pixel therefore takes its value from one of
-    the nine pixels around its previous position, the one whose disparity is closest to `new_px` [H, W].
+    Motion is not accurate to the pixel. Outside calm areas, each pixel therefore takes its value from
+    whichever of the nine pixels around its previous position has the disparity closest to `new_px` [H, W].
     """
     old_px, old_confidence, old_frames = track.disparity_px, track.confidence, track.frames
     disparity_px, confidence, frames = carried.disparity_px, carried.confidence, carried.frames
@@ -389,7 +389,7 @@ def measure_drift(new_px, carried, drift_px):
 @kernel
 @typing.no_type_check
 def blend(new, carried, calm, drift_px, mean):
-    """Write the track updated with the new frame to `mean`."""
+    """Combine `carried` with the new frame, and write the updated track to `mean`."""
     new_px, new_confidence = new.disparity_px, new.confidence
     old_px, old_confidence, old_frames = carried.disparity_px, carried.confidence, carried.frames
     disparity_px, confidence, frames = mean.disparity_px, mean.confidence, mean.frames

@@ -51,7 +51,7 @@ class Shot(NamedTuple):
     """Decoded frame.
 
     Attributes:
-        number: Number of the frame in the track.
+        number: Index of the frame in the track.
         picture: Function that converts the frame to uint8 RGB [H, W, 3]. It is called only for needed
             frames.
         is_key_frame: Whether the frame can be decoded without any earlier frame.
@@ -68,7 +68,7 @@ class VideoTrack:
     Attributes:
         name: Path as given by the caller.
         steps: Display time of each frame, strictly increasing, in units of `time_base`.
-        retimed: Numbers of the frames that are shown later because their timestamp was missing or a
+        retimed: Indices of the frames that are shown later because their timestamp was missing or a
             duplicate.
         time_base: Time unit in seconds.
         rate: Average frames per second.
@@ -99,8 +99,8 @@ class VideoTrack:
     def shots(self, start: int) -> Iterator[Shot]:
         """Yield the frames that can be decoded, in display order, always beginning with the first frame.
 
-        `start` is ignored so that all runs yield the same frames, because the artefacts that damage causes in
-        later frames depend on all frames before them.
+        `start` is ignored. The artefacts that follow a damaged frame depend on all earlier frames, so only
+        decoding from the beginning yields the same frames in every run.
         """
         with _opening(self._path) as (container, stream):
             frames = _decode(container, stream)
@@ -316,7 +316,7 @@ def _separate_duplicates(stamps: Sequence[int], frame_steps: int) -> tuple["arra
         frame_steps: Usual interval between frames, in the same units.
 
     Returns:
-        The new times, and the numbers of the delayed frames.
+        The new times, and the indices of the delayed frames.
     """
     steps, retimed = array("q", stamps[:1]), []
     later = [b for a, b in pairwise(stamps) if b > a]
@@ -335,7 +335,7 @@ def _separate_duplicates(stamps: Sequence[int], frame_steps: int) -> tuple["arra
 def _number_by_stamp(
     frames: Iterator["av.VideoFrame"], stamps: Sequence[int]
 ) -> Iterator[tuple[int, "av.VideoFrame"]]:
-    """Yield each frame with its number, found by timestamp. Frames with equal timestamps keep their order."""
+    """Yield each frame with its index, found by timestamp. Frames with equal timestamps keep their order."""
     last = -1
     for frame in frames:
         stamp = stamps[max(last, 0)] if frame.pts is None else frame.pts
@@ -348,7 +348,7 @@ def _number_by_stamp(
 def _number_by_rank(
     frames: Iterator["av.VideoFrame"], stream: "av.VideoStream"
 ) -> Iterator[tuple[int, "av.VideoFrame"]]:
-    """Yield each frame with its number, found by the position of its packet among all packets.
+    """Yield each frame with its index, found by the position of its packet among all packets.
 
     Without B-frames, a lost frame is noticed at the next frame; with B-frames, only at the next key frame.
     """

@@ -144,7 +144,7 @@ class Recorder:
                 container.mux(packet)
 
     def _add_stream(self, part: OutputContainer, frame: VideoFrame) -> VideoStream:
-        """Add a video stream for frames of this frame's size, with the colours of HD video (BT.709)."""
+        """Add a video stream for frames of the same size as `frame`, in the colours of HD video (BT.709)."""
         options = dict(self.encoding.options)
         if self.packing and self.packing.frame_packing is not None:
             options["x264-params"] = f"frame-packing={self.packing.frame_packing}"

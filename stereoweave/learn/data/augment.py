@@ -11,7 +11,7 @@ from stereoweave.stereo import Sample, StereoCamera
 
 
 def crop(sample: Sample, height: int, width: int, rng: np.random.Generator) -> Sample:
-    """Crop the sample at a random place without scaling it.
+    """Crop the sample at a random position without scaling it.
 
     Raises:
         StereoweaveError: The sample is smaller than the crop.
@@ -43,7 +43,7 @@ def augment(
         width: Width of the crop in px.
         rng: Random number generator.
         offset_share: Share of samples whose right crop is shifted to the right by up to 14 % of the width.
-            This increases their disparity, so textureless surfaces are not always far away.
+            This increases their disparity, so that textureless surfaces are not always far away.
     """
     offset = rng.uniform(0, _LARGEST_OFFSET) if offset_share and rng.random() < offset_share else 0.0
     sample = crop_and_scale(sample, height, width, rng, offset)
@@ -61,7 +61,7 @@ def augment(
 def crop_and_scale(
     sample: Sample, height: int, width: int, rng: np.random.Generator, offset: float = 0.0
 ) -> Sample:
-    """Crop the sample at a random place, and scale the crop and its disparity to height x width.
+    """Crop the sample at a random position, and scale the crop and its disparity to height x width.
 
     The right view's crop is shifted right by `offset`, a share of its width, as far as the sample allows.
     """
@@ -108,7 +108,7 @@ def crop_and_scale(
 def crop_camera(
     camera: StereoCamera | None, start_px: int, top_px: int, scale_x: float = 1.0, scale_y: float = 1.0
 ) -> StereoCamera | None:
-    """Return the camera of a crop that starts at the given column and row, after scaling.
+    """Return the camera of a crop that starts at the given column and row and is then scaled.
 
     The focal length is scaled by `scale_x`, because the horizontal focal length determines depth.
     """

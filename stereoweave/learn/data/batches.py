@@ -72,7 +72,7 @@ class Batches(Dataset[dict[str, torch.Tensor]]):
         return [crop(sample, *size, rng) for sample in samples]
 
     def _index(self, which: int, turn: int) -> int:
-        """Return the index of the pair that set `which` supplies in turn `turn`, counted from 0."""
+        """Return the index of the pair for draw `turn` from set `which`; both are counted from 0."""
         one = self.mix.sets[which]
         epoch, place = divmod(turn, one.count)
         rng = np.random.default_rng((self.recipe.seed, epoch, 1 + which))

@@ -102,7 +102,7 @@ def _make_sample(rng: np.random.Generator, left: PaintedView, right: PaintedView
 def _crop_apart(
     rng: np.random.Generator, left: PaintedView, right: PaintedView, width: int
 ) -> tuple[PaintedView, PaintedView]:
-    """Crop both views to `width`, the left view so far to the right that many disparities are below 0."""
+    """Crop both views to `width`, with the left crop so far right that many disparities are below 0."""
     spare = left.image.shape[1] - width
     start = int(np.clip(np.ceil(np.quantile(left.disparity_px, rng.uniform(0.1, 0.7))), 1, spare))
 

@@ -268,7 +268,7 @@ def _draw_markings(
 def _draw_upright(
     rng: np.random.Generator, canvas: CollageCanvas, ground: CollageSurface, nearness: float, tallness: float
 ) -> CollageLayer:
-    """Draw an upright object on the ground; `tallness` is its height in camera heights."""
+    """Draw an upright object on the ground; `tallness` is its height as a multiple of the camera's."""
     horizon = ground.plane[4]
     height = nearness * (canvas.height - horizon)
     foot_x, foot_y = rng.uniform(0, canvas.width), horizon + height

@@ -130,7 +130,7 @@ def _reduce_contrast(contrast: float, colour: Float[np.ndarray, "3"]) -> Float[n
 
 
 def _draw_gloss(rng: np.random.Generator, place: Placement) -> Float[np.ndarray, "6"]:
-    """Draw a highlight on a fifth of the layers; between the views it moves by up to 8 px on the surface."""
+    """Draw a highlight on a fifth of the layers, shifted on the surface by up to 8 px in the right view."""
     if rng.random() < 0.8:
         return np.zeros(6, np.float32)
     x, y = rng.normal([place.x, place.y], place.radius_px / 2)

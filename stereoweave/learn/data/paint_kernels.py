@@ -90,7 +90,7 @@ def warp_to_right(sheet: Sheet, width: int) -> Sheet:
 
 
 def cover(sheet: Sheet, nearest: Float[np.ndarray, "h w"], nearest_opaque: Float[np.ndarray, "h w"]) -> None:
-    """Update the disparity of the nearest sheet at each pixel with another sheet, in place.
+    """Update both maps of the nearest disparity in place with another sheet.
 
     `nearest` is raised where the sheet is nearer and covers at least half of the pixel. `nearest_opaque` is
     raised where the sheet is nearer and covers the whole pixel.

@@ -294,7 +294,7 @@ def _compute_layout(recipe: Recipe) -> tuple[dict[str, TensorPlace], int]:
 def make_cool_down_recipe(recipe: Recipe, crop_size: tuple[int, int]) -> Recipe:
     """Return the recipe with a different crop size and different pairs.
 
-    The pairs keep their margins around the crops, and a batch keeps approximately its number of pixels.
+    The margins around the crops stay the same, and a batch has about as many pixels as before.
     """
     margins = [pair - crop for pair, crop in zip(recipe.pair_size, recipe.crop_size, strict=True)]
     pair_size = (crop_size[0] + margins[0], crop_size[1] + margins[1])

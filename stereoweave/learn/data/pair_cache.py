@@ -43,8 +43,8 @@ class CachedPairs:
     def make(self, console: Console) -> Iterable[int]:
         """Make the missing pairs in parallel. Yields the index of each finished pair.
 
-        Trainings with the same folder share their pairs. The second training prints a note and waits for the
-        first one.
+        Training runs with the same folder share their pairs. If another run is making the pairs, this one
+        prints a note and waits for it.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         note = f"{self.folder}: another training is making these pairs; waiting for it"

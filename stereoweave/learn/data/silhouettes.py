@@ -38,7 +38,7 @@ class Placement:
     height: int
 
     def ring(self, angles: Float[np.ndarray, " n"], radii: Float[np.ndarray, " n"]) -> Points:
-        """Return the points at the given angles and at the given multiples of the half extent."""
+        """Return points around the centre, at the given angles and multiples of the half extent."""
         reach = self.radius_px * radii
         return np.stack([self.x + reach * np.cos(angles), self.y + reach * np.sin(angles)], axis=1)
 

@@ -68,7 +68,7 @@ class MixedSource:
         return sum(one.count for one in self.sets[:which])
 
     def draw_sets(self, places: int, rng: np.random.Generator) -> Int[np.ndarray, " n"]:
-        """Draw a set for each place by weight.
+        """Draw `places` sets at random, by weight.
 
         With the same seed, a longer sequence begins with the shorter one.
         """
@@ -104,7 +104,7 @@ class FreshCollages:
 
 @dataclass(frozen=True)
 class RenderedSet:
-    """Rendered set with simulated camera imperfections, which are the same each time that a pair is read."""
+    """Rendered set with simulated camera imperfections, which are the same each time a pair is read."""
 
     shards: Shards
 

@@ -25,8 +25,8 @@ def calibrate_confidence(network: WeaveNet) -> dict[str, Any]:
 
     A scale and a shift of the logits (Platt 1999) are fitted and folded into the last layers. The reliability
     is measured on pairs that were not used for the fit. It consists of the `calibration_error` and, for each
-    confidence bin, the `claimed` probability that the error is within 1 px, the observed frequency of this
-    (`happened`), and the bin's `share` of all pixels.
+    confidence bin, the `claimed` probability that the error is within 1 px, the share of its pixels for which
+    it is (`happened`), and the bin's `share` of all pixels.
     """
     scale, shift = _fit_scale_and_shift(*_predict_claims(network, _FIT_SEED))
     with torch.no_grad():

@@ -38,7 +38,7 @@ def export_matcher(trained: Path, out: Path, pairs: Iterable[StereoPair] = ()) -
     """Write a checkpoint's averaged network as a matcher file, and its card as .json. Returns the card.
 
     Args:
-        trained: Checkpoint, or folder of a run whose last checkpoint is used.
+        trained: Checkpoint, or the run folder whose last checkpoint is exported.
         out: The .onnx file to write.
         pairs: Pairs on which ONNX Runtime and PyTorch must agree, in addition to one collage.
 

@@ -50,8 +50,8 @@ def write_card(source: Path, out: Path, facts: dict[str, Any]) -> dict[str, Any]
 def add_nodes_between(graph: onnx.ModelProto, names: Iterable[str], operations: tuple[str, ...]) -> set[str]:
     """Return the names of the given nodes, the nodes between them, and the ReLUs after convolutions.
 
-    A node with one of `operations` counts as between the given nodes if only chosen nodes read its outputs.
-    The returned ReLUs are those that read the output of a chosen convolution.
+    A node with one of `operations` counts as between the given nodes if its outputs are read only by given
+    nodes or by others between them. The returned ReLUs read the output of a returned convolution.
     """
     readers = defaultdict(list)
     for node in graph.graph.node:

@@ -228,7 +228,7 @@ def list_providers() -> list[str]:
 
 
 def _open_sessions(made: Mapping[str, MatcherVariant], provider: str) -> dict[str, Any]:
-    """Open a session for each variant, skipping those that a provider other than the CPU rejects."""
+    """Open a session for each variant. Variants that the provider rejects are skipped, except on the CPU."""
     sessions = {}
     for name, variant in made.items():
         with contextlib.nullcontext() if provider == CPU else contextlib.suppress(MatcherError):

@@ -67,7 +67,7 @@ def prediction(inputs: int) -> nn.Conv2d:
 def mean_correlation(
     first: Float[Tensor, "b c h w"], second: Float[Tensor, "b c h w"]
 ) -> Float[Tensor, "b 41 h w"]:
-    """Return the mean over channels of column x of `first` times column x - d of `second`, d = 0 .. 40."""
+    """Return the channel mean of column x of `first` times column x - d of `second`, for d = 0 .. 40."""
     return correlation_volume(first, second, LEVELS) / first.shape[1]
 
 

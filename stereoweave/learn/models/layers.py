@@ -141,8 +141,8 @@ def local_soft_argmax(logits: Float[Tensor, "b d h w"]) -> Float[Tensor, "b 1 h 
 
     Restricting the softmax to a window keeps a distant second candidate from pulling the mean off the
     surface. The window first covers 2 levels on each side of the best level. It is then centred on the mean
-    three times, with weights that fade out over 3 levels. Rounding that decides which of two
-    levels is best therefore hardly changes the result.
+    three times, with weights that fade out over 3 levels. The result therefore hardly changes if rounding
+    decides which of two levels is best.
     """
     best = logits.detach().argmax(1, keepdim=True)
     near, reach = 2, 3

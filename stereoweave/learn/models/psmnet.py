@@ -55,7 +55,7 @@ def norm_expansion_3d(inputs: int, outputs: int) -> nn.Sequential:
 
 
 class BasicBlock(nn.Module):
-    """Residual block of two 3x3 convolutions, with a 1x1 convolution as shortcut if the shape changes."""
+    """Residual block of two 3x3 convolutions, whose shortcut is a 1x1 convolution if the shape changes."""
 
     def __init__(self, inputs: int, outputs: int, stride: int = 1, dilation: int = 1) -> None:
         super().__init__()

@@ -39,7 +39,7 @@ class WeaveSize:
     Attributes:
         channels: Number of channels of the encoder's maps.
         convolutions: Number of the encoder's 3x3 convolutions at each resolution, besides the convolution
-            that halves the resolution. Every two of them form a residual block.
+            that halves the resolution. Each pair of them forms a residual block.
         dilations: Dilations of the dense blocks at 1/8 resolution.
         growth: Number of channels that each dense block adds.
         bottleneck: Number of output channels of the dense blocks.

@@ -25,11 +25,11 @@ class RunClock:
     total_minutes: float
 
     def elapsed_s(self, now_s: float) -> float:
-        """Return the time of the run used so far, in seconds."""
+        """Return the time that the run has used so far, in seconds."""
         return self.used_s + now_s - self.began_s
 
     def elapsed_share(self, now_s: float) -> float:
-        """Return the share of the run's time used so far, 0 to 1. At 1, the last command stops training."""
+        """Return the used share of the run's time, 0 to 1. At 1, the last command stops training."""
         return min(self.elapsed_s(now_s) / (60 * self.total_minutes - RESERVE_S), 1.0)
 
     def remaining_s(self, now_s: float) -> float:
@@ -43,7 +43,7 @@ def learning_rate_at(recipe: Recipe, optimiser_steps: int, share: float) -> floa
     """Return the learning rate, with a linear warm-up over steps, a constant phase and a linear decay to 0.
 
     Args:
-        recipe: Recipe of the run. The decay takes the share `cool_down_steps / steps` of the time.
+        recipe: Recipe of the run. The decay takes up a share of `cool_down_steps / steps` of the time.
         optimiser_steps: Steps since the optimiser last started without a state.
         share: Share of the run's time used so far.
     """

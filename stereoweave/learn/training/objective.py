@@ -159,7 +159,7 @@ class CodeObjective:
         """Return the means of the loss, its terms and the errors over held-out pairs.
 
         `squared_error` is the squared error of the linear code, without the exponent. Unlike the loss, it can
-        be compared between exponents. `depth_error_m` is returned only if the target is depth.
+        be compared across exponents. `depth_error_m` is returned only if the target is depth.
         """
         network.eval()
         rows = []

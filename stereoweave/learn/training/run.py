@@ -31,7 +31,7 @@ _LOGGER = logging.getLogger(__name__)
 
 
 class TrainingRun(ModelState):
-    """The state of a run of `train`, and the device and ranks that train it."""
+    """The state of a run of `train`, with its device and ranks."""
 
     def __init__(self, recipe: Recipe, start: Checkpoint, fabric: Fabric) -> None:
         self.recipe, self.fabric, self.by_class = recipe, fabric, open_held_out_sets(recipe)
@@ -146,7 +146,7 @@ def _update_average(
     current: Sequence[torch.Tensor],
     steps: torch.Tensor | int,
 ) -> None:
-    """Move the average towards the current weights, faster at first to forget the initial weights soon."""
+    """Move the average towards the current weights, faster at first to shed the initial weights quickly."""
     share = max(1 / averaged_steps, 9 / (9 + float(steps)))
     for average, value in zip(averaged, current, strict=True):
         if average.is_floating_point():

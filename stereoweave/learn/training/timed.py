@@ -136,7 +136,7 @@ class _TimedLoop:
                 self._save({})
 
     def finish(self, held_out: PairSource) -> None:
-        """Score and save the run, and report the scores."""
+        """Score the run unless time or held-out pairs are lacking, save it, and report the results."""
         too_late = self.clock.remaining_s(time.monotonic()) < -RESERVE_S
         if too_late or (isinstance(held_out, CachedPairs) and held_out.missing()):
             self.report("not scored: out of time" if too_late else "not scored: no held-out pairs")

@@ -179,7 +179,7 @@ class TimedRun(ModelState):
 
     @torch.no_grad()
     def _restore_statistics(self) -> None:
-        """Copy the batch-norm statistics of the averaged network, which are always finite."""
+        """Overwrite the network's batch-norm statistics with the average's, which are always finite."""
         for value, kept in zip(self.network.buffers(), self.averaged.module.buffers(), strict=True):
             value.copy_(kept)
 

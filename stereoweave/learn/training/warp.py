@@ -10,7 +10,7 @@ def reconstruct_left(
 ) -> tuple[Float[Tensor, "b c h w"], Bool[Tensor, "b 1 h w"]]:
     """Warp the right image to the left view. Returns the warped image and the mask of pixels with a match.
 
-    Pixel (i, j) of disparity d is interpolated linearly at (i - d, j) in the right image. It has a match if
+    Pixel (i, j) with disparity d is interpolated linearly at (i - d, j) in the right image. It has a match if
     0 <= i - d <= W - 1; otherwise its value is meaningless and has no gradient.
 
     Args:

@@ -34,7 +34,7 @@ def panel(height_m: float, cover: int, steel: int) -> Mesh:
 
 
 def drum(radius_m: float, cover: int, steel: int) -> Mesh:
-    """Build a shrouded microwave dish with a bulging cover and a bracket."""
+    """Build a shrouded microwave dish with a domed cover and a bracket."""
     r, depth = radius_m, 0.75 * radius_m
     profile = np.array(
         [
@@ -96,7 +96,7 @@ def satellite_dish(radius_m: float, cover: int, steel: int) -> Mesh:
 
 
 def yagi(length_m: float, count: int, steel: int, end: int) -> Mesh:
-    """Build a Yagi antenna with a folded dipole and a reflector of rods.
+    """Build a Yagi antenna with a folded dipole and a rod reflector.
 
     The directors get shorter towards the front.
     """

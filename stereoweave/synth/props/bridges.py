@@ -140,7 +140,7 @@ def street_lamps(plan: BridgePlan, start_m: float, end_m: float, material: int, 
 def pier(plan: BridgePlan, at_m: float, top_m: float, *, thick_m: float = 0.32, wide_m: float = 0.3) -> Mesh:
     """Build a river pier with pointed ends and its top at z = top_m.
 
-    Without its pointed ends, the pier is wide_m wider than the road.
+    wide_m: how much wider than the road the pier is, not counting its pointed ends.
     """
     y = plan.width_m / 2 + wide_m / 2
     outline = np.array([(0.5, -y), (0.5, y), (0, y + 0.2), (-0.5, y), (-0.5, -y), (0, -y - 0.2)]) * [

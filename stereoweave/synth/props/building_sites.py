@@ -1,4 +1,4 @@
-"""Building sites with a concrete shell, scaffolding, site offices, a hoarding and a town."""
+"""Building sites near a town, with a concrete shell, scaffolding, site offices and a hoarding."""
 
 import numpy as np
 
@@ -13,7 +13,10 @@ BAY_M, STOREY_M = 0.95, 0.52
 
 
 def building_site(rng: np.random.Generator, palette: Palette) -> Mesh:
-    """Build a site with its concrete shell at negative y, behind a crane seen from positive y."""
+    """Build a site with its concrete shell at negative y.
+
+    Cameras at positive y see the shell behind the crane.
+    """
     small = np.diag([SCALE, SCALE, SCALE, 1.0])
     town = draw_spots(rng, 20, 17 / SCALE, 60 / SCALE)
     stacks = draw_spots(rng, 7, 2 / SCALE, 5 / SCALE)
@@ -90,7 +93,7 @@ def _props(rng: np.random.Generator, x: np.ndarray, y: np.ndarray, floor_m: floa
 
 
 def _scaffolding(size_m: np.ndarray, floors: int, tube: int, board: int) -> Mesh:
-    """Build scaffolding with standards, ledgers, braces and planks in front of the visible side."""
+    """Build scaffolding with standards, ledgers, braces and planks in front of the shell's visible side."""
     x = np.linspace(-size_m[0] / 2, 0.1 * size_m[0], 6)
     y = size_m[1] / 2 + np.array([0.06, 0.3])
     z = np.arange(0, floors + 1) * STOREY_M

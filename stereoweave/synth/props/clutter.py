@@ -158,7 +158,7 @@ def _points_in_view(
 
 
 def _place_mesh(rng: np.random.Generator, mesh: Mesh, place: _ClutterPlacement, floor_m: float) -> Mesh:
-    """Rotate and scale a mesh with its texture, and move it to its position.
+    """Rotate a mesh, scale it together with its texture, and move it to its position.
 
     Standing objects are moved onto the floor.
     """

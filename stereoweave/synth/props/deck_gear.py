@@ -43,7 +43,7 @@ def winch(at_m: Point, width_m: float, materials: ShipMaterials, load: int) -> M
 
 
 def gantry(at_m: Point, width_m: float, height_m: float, materials: ShipMaterials) -> Mesh:
-    """Build a gantry over the stern that leans aft and carries hanging blocks."""
+    """Build a gantry that leans aft over the stern and carries hanging blocks."""
     half, lean = width_m / 2, -0.25 * height_m
     frame = [(0, -half, 0), (lean, -0.85 * half, height_m), (lean, 0.85 * half, height_m), (0, half, 0)]
     portal = polyline_tubes(frame, 0.06, materials.trim, sides=12)
@@ -63,7 +63,7 @@ def gantry(at_m: Point, width_m: float, height_m: float, materials: ShipMaterial
 
 
 def derrick(foot_m: Point, tip_m: Point, top_m: Point, materials: ShipMaterials) -> Mesh:
-    """Build a derrick: a boom from foot to tip, with a hook, held by wires from top_m."""
+    """Build a derrick: a boom from foot to tip, held by wires from top_m and carrying a hook."""
     middle = (foot_m + tip_m) / 2
     boom = tubes(
         [foot_m, middle], [middle, tip_m], np.array([[0.03, 0.05], [0.05, 0.025]]), materials.trim, sides=12

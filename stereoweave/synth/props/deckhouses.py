@@ -189,7 +189,7 @@ def ship_mast(rng: np.random.Generator, foot_m: Point, height_m: float, material
 
 
 def _radar(rng: np.random.Generator, at_m: Point, materials: ShipMaterials) -> Mesh:
-    """Build a radar scanner with a pedestal and a bracket in front of the mast."""
+    """Build a radar scanner on a pedestal and a bracket in front of the mast."""
     spin = rotation((0, 0, 1), rng.uniform(0, 180))[None, :3, :3]
     bar = boxes(at_m + [0, 0, 0.14], (0.07, 0.75, 0.07), materials.white, spin)
     bracket = boxes(at_m + [-0.06, 0, -0.02], (0.24, 0.1, 0.03), materials.white)
@@ -204,7 +204,7 @@ def stays(tops_m: Points, feet_m: Points, materials: ShipMaterials) -> Mesh:
 
 
 def lifebuoys(at_m: Points, outwards: Points, materials: ShipMaterials) -> Mesh:
-    """Build lifebuoys with four orange and four white segments, facing in the directions `outwards`."""
+    """Build lifebuoys facing the directions `outwards`, each with four orange and four white segments."""
     angle = np.linspace(0, 2 * np.pi, 9)
     ring = lathe(
         np.stack([0.15 + 0.04 * np.cos(angle), 0.04 * np.sin(angle)], -1), materials.orange, sections=24

@@ -43,7 +43,7 @@ def chair(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def table(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """Build a table with cups on it: a round table on one foot, or a rectangular table on four legs."""
+    """Build a round pedestal table, or a rectangular table with four legs, with cups on it."""
     height_m = rng.uniform(0.45, 0.75)
     if rng.random() < 0.4:
         rim = np.array([[0, 0.96], [0.5, 0.96], [0.5, 1.0], [0.0, 1.0]]) * [1, height_m]
@@ -71,7 +71,7 @@ def leaning_ladder(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def shelf(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """Build a bookcase with boards between two sides, filled with books."""
+    """Build a bookcase filled with books: shelves between two side panels."""
     count, depth_m = int(rng.integers(2, 6)), rng.uniform(0.16, 0.28)
     levels = np.linspace(0.03, 1.0, count + 1)
     boards = boxes([[0, 0, z] for z in levels], [0.7, depth_m, 0.02], style.main)

@@ -35,7 +35,8 @@ def shell(
 ) -> Mesh:
     """Build a room around the z axis, with its floor at z = 0 and objects on its walls.
 
-    open_side: number of the wall to omit, counted counter-clockwise from 0 at the largest x; None keeps all.
+    open_side: index of the wall to omit, or None to keep all four; 0 is the wall at the largest x, and the
+        others follow counter-clockwise.
     """
     x, y, height_m = (float(v) for v in size_m)
     distance_m = 0.6 * max(x, y)
@@ -72,7 +73,7 @@ def pendants(
 
 
 def draw_lamps(rng: np.random.Generator, spots_m: Float[np.ndarray, "n 3"]) -> tuple[Lamp, ...]:
-    """Draw random lamps for a room, all of the same warm or cold colour but of different strengths."""
+    """Draw random lamps for a room, all of one warm or cold colour but of different strengths."""
     warm = rng.uniform(0, 1)
     colour = np.array([1.0, 0.95 - 0.2 * warm, 0.92 - 0.5 * warm])
     strengths = np.exp(rng.normal(0, 0.6, len(spots_m)))
@@ -94,7 +95,7 @@ def draw_lamp_spots(
 
 
 def indoor_light(rng: np.random.Generator, sky: Sky, lamps: Sequence[Lamp]) -> tuple[Sky, float]:
-    """Draw random ambient light for a room, as a sky without a sun, and the exposure of the images."""
+    """Draw random ambient light for a room, in the form of a sunless sky, and the exposure of the images."""
     ambient = rng.uniform(0.15, 0.6)
     warm = np.array([1.0, 0.95, 0.87])
 
@@ -234,7 +235,7 @@ def _radiator(rng: np.random.Generator, palette: Palette, width_m: float, height
 
 
 def _curtain(rng: np.random.Generator, palette: Palette, width_m: float, height_m: float, trim: int) -> Mesh:
-    """Build a folded curtain on a rod."""
+    """Build a curtain hanging in folds from a rod."""
     cloth = palette.add(draw_material_from(rng, ("cloth", "plain", "photograph"), 4.0))
     high_m = min(height_m - 0.1, 2.4)
     x, z = np.meshgrid(np.linspace(-0.5, 0.5, 60) * width_m, np.linspace(0.05, high_m, 14))

@@ -259,7 +259,7 @@ def galvanised_steel(rng: np.random.Generator) -> Material:
 
 
 def painted_steel(rng: np.random.Generator, tint: Colour, roughness: float = 0.55) -> Material:
-    """Draw a material for painted steel in a slight variation of the given colour."""
+    """Draw a material for painted steel, slightly lighter or darker than the given colour."""
     shade = rng.uniform(0.85, 1.1)
     red, green, blue = (float(np.clip(shade * part, 0, 1)) for part in tint)
     return Material(

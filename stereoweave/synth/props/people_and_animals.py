@@ -1,4 +1,4 @@
-"""Rounded people and animals without facial detail, standing on z = 0 and facing +x."""
+"""Rounded figures of people and animals without faces, standing on z = 0 and facing +x."""
 
 from dataclasses import dataclass
 
@@ -115,7 +115,7 @@ def _bent_limb(
 
 
 def _ellipses(heights_and_halves_m: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 24 3"]:
-    """Return horizontal ellipses [K, 24, 3], given rows of height and half-widths along x and y."""
+    """Return horizontal ellipses [K, 24, 3], one per row (height, half-width along x, half-width along y)."""
     angle = np.arange(24) * 2 * np.pi / 24
     z, along, across = (column[:, None] for column in heights_and_halves_m.T)
     return np.stack([along * np.cos(angle), across * np.sin(angle), z + 0 * angle], -1)

@@ -376,7 +376,7 @@ class _TubeTopology(NamedTuple):
     Attributes:
         circle: [S + 1, 2], unit circle; the last point repeats the first.
         points: [T, 3], indices into the points: the ring at the start, the ring at the end and both centres.
-        normals: [T, 3], indices into the normals: a ring, then backwards and forwards along the tube.
+        normals: [T, 3], indices into the normals: those of a ring, then those of the start and end caps.
         uv: [T, 3], indices into the texture coordinates: both rings for the sides, then all points for the
             ends.
     """
@@ -406,7 +406,7 @@ def _tube_topology(sides: int, capped: bool) -> _TubeTopology:
 
 @functools.cache
 def _cube() -> tuple[Float[np.ndarray, "12 3 3"], Float[np.ndarray, "12 3 3"]]:
-    """Return the triangles and normals of a cube of side 2 around the origin."""
+    """Return the triangles and normals of a cube of side 2 centred on the origin."""
     corners = np.array(list(product((-1.0, 1.0), repeat=3)))
     triangles = corners[np.array(_CUBE_FACES)]
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]) / 4

@@ -92,7 +92,7 @@ def draw_propeller(rng: np.random.Generator) -> Propeller:
 
 
 def propeller_mesh(propeller: Propeller, bronze: int, hub: int, bolt: int) -> Mesh:
-    """Build the blades, hub, cap and bolts around the origin; one blade points up."""
+    """Build a propeller centred on the origin, with its hub, cap and bolts; one blade points up."""
     blade = loft(propeller.sections_m(), bronze)
     # Planar texture coordinates keep the texture from being squeezed at the tip.
     blade = replace(blade, uv_m=blade.corners_m[..., 1:].copy())

@@ -54,7 +54,7 @@ def draw_material_from(rng: np.random.Generator, families: tuple[str, ...], dist
 
 
 def draw_broad_material(rng: np.random.Generator, families: tuple[str, ...], distance_m: float) -> Material:
-    """Draw a random material for a wall, floor or table, which is usually plain."""
+    """Draw a random, usually plain material for a wall, floor or table."""
     if rng.random() >= _BROAD_PLAIN:
         return draw_material_from(rng, families, distance_m)
     return Material(

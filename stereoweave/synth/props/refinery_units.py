@@ -1,6 +1,6 @@
 """Refinery units at a tenth of their real size: columns, tanks, pressure vessels and stacks.
 
-Each unit stands on z = 0 around the z axis and lists its nozzles.
+Each unit stands on z = 0, centred on the z axis, and lists its nozzles.
 """
 
 from dataclasses import dataclass
@@ -162,7 +162,7 @@ def drum_tank(rng: np.random.Generator, materials: RefineryMaterials) -> Refiner
 
 
 def pressure_vessels(rng: np.random.Generator, materials: RefineryMaterials) -> RefineryUnit:
-    """Build two to four horizontal pressure vessels with round ends on saddles, in one or two stacks.
+    """Build two to four horizontal, round-ended pressure vessels on saddles, in one or two stacks.
 
     A platform and a ladder give access to the vessels.
     """

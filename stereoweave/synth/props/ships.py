@@ -25,7 +25,7 @@ class ShipPlan:
         funnels: coordinates (x, y) of each funnel on the deckhouse.
         mast_m: x coordinate and height of the mast on the bridge.
         fenders: whether tyres hang along the sides.
-        build_gear: function that builds the deck gear; its last argument lists the materials of containers.
+        build_gear: function that builds the deck gear; its last argument lists the container materials.
     """
 
     hull: Hull
@@ -43,7 +43,7 @@ class ShipPlan:
 
 @dataclass(frozen=True, kw_only=True)
 class _HullRanges:
-    """Dimensions of the hulls of one trade, as fixed values or ranges; see `Hull`."""
+    """Hull dimensions for one type of ship, as fixed values or ranges; see `Hull`."""
 
     length_m: Range
     beam_m: Range

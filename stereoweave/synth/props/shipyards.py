@@ -239,7 +239,7 @@ def _tower(rng: np.random.Generator, high_m: float, steel: int, planks: int) -> 
 
 
 def _netting(rng: np.random.Generator, high_m: float, cloth: int) -> Mesh:
-    """Build netting: a folded sheet on the front of a scaffold."""
+    """Build netting that hangs in folds on the front of a scaffold."""
     y, z = np.meshgrid(np.linspace(-2.3, 2.3, 28), np.linspace(rng.uniform(0.3, 1.2), high_m - 0.1, 14))
     folds = 0.05 * np.sin(y * rng.uniform(4, 7) + rng.uniform(0, 6)) * np.sin(z * 1.7 + rng.uniform(0, 6))
     return sheet(np.stack([0.53 + abs(folds), y, z], -1), cloth)

@@ -102,7 +102,7 @@ def bottle(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def lamp(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """Build a floor lamp with a foot, a rod and a shade."""
+    """Build a floor lamp with a base, a pole and a shade."""
     foot_m, rod_m, low_m = rng.uniform(0.12, 0.22), rng.uniform(0.012, 0.03), rng.uniform(0.55, 0.7)
     stand = np.array([[0, 0], [foot_m, 0], [foot_m, 0.03], [rod_m, 0.06], [rod_m, 0.9], [0.0, 0.9]])
     wide_m, narrow_m = rng.uniform(0.2, 0.32), rng.uniform(0.08, 0.2)
@@ -188,7 +188,7 @@ def arch(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def stairs(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """Build stairs of blocks of increasing height."""
+    """Build stairs from blocks of increasing height."""
     count = int(rng.integers(4, 9))
     step_m, wide_m = 1.0 / count, rng.uniform(0.3, 0.8)
     k = np.arange(count)

@@ -24,7 +24,7 @@ class Stern:
         mesh: hull with fittings, without the propeller.
         keel_m: height of the keel.
         hull: the hull in its own coordinates, with the bow at +x and the waterline at z = 0.
-        end_m: x of the hull's aft end.
+        end_m: x coordinate of the hull's aft end.
         water_m: height of the waterline.
     """
 

@@ -170,7 +170,7 @@ def draw_spots(rng: np.random.Generator, count: int, nearest_m: float, farthest_
 def trees(
     rng: np.random.Generator, palette: Palette, spots: Spots, height_m: tuple[float, float] = (4, 9)
 ) -> Mesh:
-    """Build broad and slender trees at the spots.
+    """Build broad-leaved trees and firs at the spots.
 
     height_m: minimum and maximum height.
     """
@@ -274,7 +274,7 @@ def bollards(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
 
 
 def cones(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
-    """Build traffic cones with a white band, 0.55 m high, at the spots."""
+    """Build traffic cones, 0.55 m high and with a white band, at the spots."""
     orange = palette.add(Material(texture="plain", tint=(0.8, 0.2, 0.06), roughness=0.6))
     white = palette.add(Material(texture="plain", tint=(0.85, 0.85, 0.85), roughness=0.5))
     below = lathe([(0.14, 0.03), (0.1, 0.2)], orange, 16)
@@ -330,7 +330,7 @@ def _add_foliage(rng: np.random.Generator, palette: Palette) -> int:
 
 
 def _tree(rng: np.random.Generator, bark: int, leaves: int, spread: float) -> Mesh:
-    """Build a broad tree of height 1, with a forked trunk and lumps of foliage."""
+    """Build a broad tree of height 1, with a forked trunk and clumps of foliage."""
     fork = np.array([0, 0, 0.35])
     tips = rng.uniform((-0.2, -0.2, 0.6), (0.2, 0.2, 0.8), (4, 3))
     trunk = tubes([0, 0, -0.1], fork, [[0.04, 0.028]], bark, 7, capped=False)

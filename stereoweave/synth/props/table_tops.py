@@ -1,6 +1,6 @@
 """Tables close to the cameras, with upright boards and a wall close behind them.
 
-The cameras are towards +x, the centre of their view is above the origin, and the floor is at z = 0.
+The cameras are on the +x side, their view is centred above the origin, and the floor is at z = 0.
 """
 
 from dataclasses import dataclass
@@ -25,8 +25,8 @@ class TableTop:
     Attributes:
         distance_m: distance from the cameras to the centre of the view.
         height_m: height of the table's surface.
-        behind_m: distance from the centre to the wall, where the table ends.
-        before_m: distance from the centre to the front edge.
+        behind_m: distance from the centre of the view to the wall, where the table ends.
+        before_m: distance from the centre of the view to the front edge of the table.
         width_m: width of the table across the view.
     """
 
@@ -38,7 +38,7 @@ class TableTop:
 
 
 def draw_table_top(rng: np.random.Generator) -> TableTop:
-    """Draw random dimensions for a table, which usually fills the width of the image."""
+    """Draw random dimensions for a table that usually fills the width of the image."""
     distance_m = rng.uniform(1.5, 2.3)
     return TableTop(
         distance_m=distance_m,

@@ -102,7 +102,7 @@ def loose_wires(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def mobile(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """Build a mobile: a bar with balls that hang on threads."""
+    """Build a mobile: balls that hang on threads from a bar."""
     count = int(rng.integers(3, 9))
     x, drop_m = np.linspace(-0.45, 0.45, count), rng.uniform(0.15, 0.9, count)
     lower = _points(x, -drop_m)

@@ -105,7 +105,7 @@ def _plane(plan: BridgePlan, low: Joints, top: Joints, braced: str) -> Mesh:
 
 
 def _lift_tower(plan: BridgePlan, height_m: float, raised_m: float, concrete: int) -> Mesh:
-    """Build a tower around the road, next to a lift span at smaller x.
+    """Build a tower that the road passes through, on the +x side of the lift span.
 
     The higher the span is raised, the lower the counterweight hangs.
     """

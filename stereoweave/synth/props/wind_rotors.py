@@ -60,7 +60,7 @@ def composite_skin(rng: np.random.Generator) -> Material:
 
 
 def turbine_head(rotor: Rotor, materials: TurbineMaterials, around: int = 18) -> Mesh:
-    """Build the nacelle, hub and blades above the top of the tower, which is at the origin.
+    """Build the nacelle, hub and blades of a turbine; the top of its tower is at the origin.
 
     around: number of points per blade section.
     """

@@ -11,7 +11,7 @@ class Effects:
 
     Attributes:
         shadows: Shadows cast by the sun.
-        ambient_occlusion: Weaker skylight in corners and narrow places.
+        ambient_occlusion: Dimmer skylight in corners and narrow gaps.
         gloss: Highlights from the sun and lamps, and reflections of the sky.
         fog: Haze that grows with distance.
         relief: Bump mapping from the texture's height map.

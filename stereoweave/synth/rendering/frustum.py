@@ -56,7 +56,7 @@ def triangles_in_view(
 
 
 def _image_edges(rig: PosedRig) -> Float[np.ndarray, "2 2"]:
-    """Return the coordinates of the image's borders at depth 1, as [[left, right], [upper, lower]]."""
+    """Return the coordinates of the image's borders at depth 1, as [[left, right], [top, bottom]]."""
     camera, (width_px, height_px) = rig.camera, rig.size_px
     borders_px = np.array([[-0.5, width_px - 0.5], [-0.5, height_px - 0.5]])
     return (borders_px - [[camera.cx_px], [camera.cy_px]]) / camera.focal_px

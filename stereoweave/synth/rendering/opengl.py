@@ -118,7 +118,7 @@ class OpenGLRenderer:
         )
 
     def _frame_buffers(self, rig: PosedRig) -> FrameBuffers:
-        """Return frame buffers for the rig's image size; those for the last size are cached."""
+        """Return frame buffers for the rig's image size; those for the most recent size are cached."""
         if self._last_frame_buffers is None or self._last_frame_buffers.size_px != rig.size_px:
             if self._last_frame_buffers is not None:
                 self._last_frame_buffers.release()
@@ -126,7 +126,7 @@ class OpenGLRenderer:
         return self._last_frame_buffers
 
     def _upload(self, world: World) -> Geometry:
-        """Return the world's triangles in GPU memory; those of the last world are cached."""
+        """Return the world's triangles in GPU memory; those of the most recent world are cached."""
         if self._geometry is None or self._geometry.world is not world:
             fresh = Geometry(self._gl, world)
             if self._geometry is not None:

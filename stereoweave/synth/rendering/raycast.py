@@ -1,4 +1,4 @@
-"""Embree ray caster for images and exact depth, slower and plainer than `opengl`.
+"""Embree ray caster for images and exact depth, slower than `opengl` and with fewer effects.
 
 It is the fallback if OpenGL does not start, and the tests use it as an independent reference for the OpenGL
 renderer.
@@ -161,7 +161,7 @@ def _intersect_planes(
 
 
 def _interpolate_normals(mesh: Mesh, hits: _Hits, directions: Vectors) -> Vectors:
-    """Return the interpolated unit normals on the side that faces the ray."""
+    """Return the interpolated unit normals, flipped where needed to the side that the ray comes from."""
     first, second, third = mesh.corners_m[hits.triangle].transpose(1, 0, 2)
     face = np.cross(second - first, third - first)
     normal = np.einsum("pc,pcx->px", hits.shares, mesh.normals[hits.triangle])

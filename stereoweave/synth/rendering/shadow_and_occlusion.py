@@ -94,7 +94,7 @@ class OcclusionGrid:
     Attributes:
         share: Blocked fraction of the sky, uint8 [CELLS, CELLS, CELLS] indexed by z, y and x; 255 means the
             whole sky.
-        low_m: Corner of the grid with the least coordinates.
+        low_m: The grid's corner with the smallest x, y and z.
         cell_m: Side of a cell.
     """
 
@@ -137,7 +137,7 @@ def _hidden_share(surface: Float[np.ndarray, "z y x"]) -> UInt8[np.ndarray, "z y
 
 
 def _cut_large(corners_m: Corners, low_m: Float[np.ndarray, "3"], cell_m: float) -> Corners:
-    """Return the triangles that touch the grid, large ones subdivided so that few samples lie outside it."""
+    """Return the triangles that touch the grid, with large ones subdivided so that few samples miss it."""
     done = []
     rest = _select_near(corners_m, low_m, cell_m * CELLS)
     while rest.size:

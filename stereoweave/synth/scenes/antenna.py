@@ -69,7 +69,7 @@ class MastMaterials:
 
 
 def antenna(rng: np.random.Generator) -> Stage:
-    """Build a stage with a mast of 6.5 m, roof antennas of 3 m, or a dish of 4 m."""
+    """Build a stage with a mast about 6 m tall, roof antennas up to 3.3 m tall, or a 4 m dish."""
     kind = str(rng.choice(["mast", "roof", "dish"], p=[0.5, 0.25, 0.25]))
     return {"mast": _mast_site, "roof": roof_antennas, "dish": radio_dish}[kind](rng)
 

@@ -88,7 +88,7 @@ def _street_lamps(rng: np.random.Generator, palette: Palette, plan: BridgePlan) 
 
 
 def _traffic(rng: np.random.Generator, palette: Palette, plan: BridgePlan, fifths: Sequence[int]) -> Mesh:
-    """Build two or more vehicles driving on the right in two lanes, on the given fifths of the road."""
+    """Build two or more vehicles in two lanes, driving on the right, in the given fifths of the road."""
     kinds = [vehicle.transform(np.diag([SCALE, SCALE, SCALE, 1.0])) for vehicle in fleet(rng, palette)]
     slots = rng.permutation([(fifth, lane) for fifth in fifths for lane in (0, 1)])
     placed = []

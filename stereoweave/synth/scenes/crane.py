@@ -77,7 +77,7 @@ class TowerCraneMaterials:
 
 
 def crane(rng: np.random.Generator) -> Stage:
-    """Build a stage with a tower crane of 5.5 to 6.5 m or a container crane of about 6 m."""
+    """Build a stage with a tower crane or a container crane, about 6 m in its largest dimension."""
     return _tower_crane(rng) if rng.random() < 0.68 else quay_crane(rng)
 
 

@@ -44,7 +44,7 @@ def figures(rng: np.random.Generator) -> Stage:
 
 
 def _cast(rng: np.random.Generator, palette: Palette, distance_m: float) -> Mesh:
-    """Build figures between the cameras, which are at x = distance_m, and a point behind the centre."""
+    """Build figures from close to the cameras, at x = distance_m, to a few metres beyond the centre."""
     clothes = [draw_clothes(rng, palette) for _ in range(3)]
     kinds = [animal(rng, palette) for _ in range(2)]
     depths_m = np.geomspace(rng.uniform(0.95, 1.8), distance_m + 4, int(rng.integers(3, 8)))

@@ -123,7 +123,7 @@ def _table_top(rng: np.random.Generator, palette: Palette) -> _Foreground:
 
 
 def _wall(rng: np.random.Generator, palette: Palette) -> _Foreground:
-    """Build a wall, seen frontally or obliquely, and a sideboard with places for objects."""
+    """Build a wall, seen head-on or at an angle, and a sideboard with places for objects."""
     distance_m, eye_m = rng.uniform(1.1, 1.7), rng.uniform(0.95, 1.3)
     turned_deg = rng.choice([-1, 1]) * rng.uniform(0, 60)
     length_m, end_m = rng.uniform(0.9, 1.6) * distance_m, rng.uniform(-0.1, 0.3)
@@ -147,7 +147,7 @@ def _wall(rng: np.random.Generator, palette: Palette) -> _Foreground:
 
 
 def _board(rng: np.random.Generator, palette: Palette, width_m: float, top_m: float) -> Mesh:
-    """Build a board, partition or cupboard of height top_m, with its front at y = 0, perhaps on feet."""
+    """Build a board, partition or cupboard of height top_m, with its front at y = 0, sometimes on feet."""
     low_m = 0.0 if rng.random() < 0.6 else rng.uniform(0.05, 0.3) * top_m
     depth_m, tall_m = rng.choice([rng.uniform(0.01, 0.04), rng.uniform(0.15, 0.5)]), top_m - low_m
     middle_m, trim = low_m + tall_m / 2, palette.add(_trim(rng))
@@ -202,7 +202,7 @@ def _spots(
     level_m: float,
     sizes: tuple[float, float],
 ) -> Float[np.ndarray, "n 4"]:
-    """Draw a spot across the view at each y; sizes are fractions of the distance to the cameras."""
+    """Draw one spot at each y, spread across the view; sizes are fractions of the distance to the cameras."""
     away_m = along_m + distance_m
     x = rng.permutation(np.linspace(-1.3, 1.3, len(along_m))) * _HALF_VIEW * away_m
     sizes_m = rng.uniform(*sizes, len(along_m)) * away_m

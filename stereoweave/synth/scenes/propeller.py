@@ -35,7 +35,7 @@ class _Surroundings:
 
 
 def propeller(rng: np.random.Generator) -> Stage:
-    """Build a stage with a propeller of 4.6 to 5.6 m, seen from aft."""
+    """Build a stage with a propeller 4.6 to 5.6 m in diameter, seen from aft."""
     palette, propeller = Palette(), draw_propeller(rng)
     bolt = palette.add(Material(texture="steel", tint=(0.5, 0.5, 0.5), roughness=0.5, metal=0.7))
     bronze = palette.add(_draw_finish(rng))

@@ -42,7 +42,7 @@ class PylonPlan:
     """Dimensions of a tower; the line runs along y and the arms along x.
 
     Attributes:
-        arms: For each arm, from the lowest up, its height_m, reach_m and number of conductors per side.
+        arms: One (height_m, reach_m, number of conductors per side) for each arm, lowest first.
         widths_m: Widths of the body at the ground, at the lowest arm and at the highest arm.
         span_m: Distance to the next tower.
         strained: Whether tension insulators along the line replace suspension insulators.
@@ -62,7 +62,7 @@ class PylonPlan:
 
 
 def pylon(rng: np.random.Generator) -> Stage:
-    """Build a stage with a tower of 6.5 to 7.5 m."""
+    """Build a stage with a tower 6.5 to 7.5 m tall."""
     palette, plan = Palette(), _draw_plan(rng)
     tower, steel = _tower(rng, palette, plan)
     lines, wire = _lines(rng, palette, plan)

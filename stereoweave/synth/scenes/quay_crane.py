@@ -131,7 +131,7 @@ def _climb(materials: QuayCraneMaterials) -> Mesh:
 
 
 def _boom(materials: QuayCraneMaterials) -> Mesh:
-    """Build two lattice girders with walkways and cross beams, and the machinery house at their back."""
+    """Build two lattice girders with walkways and cross beams, and a machinery house at the landward end."""
     x = np.linspace(BACK_M, TIP_M, 22)
     square = np.array([[-0.06, -0.0], [0.06, -0.0], [0.06, 0.26], [-0.06, 0.26]])
     parts = []
@@ -208,7 +208,7 @@ def _trolley(rng: np.random.Generator, materials: QuayCraneMaterials, colours: l
 
 
 def _container(colour: int, dark: int) -> Mesh:
-    """Build a container along x on z = 0, with ribbed sides, posts, and locking bars on its doors."""
+    """Build a container along x, on z = 0, with ribbed sides, posts, and locking bars on its doors."""
     length, width, height = CONTAINER_M
     x = np.linspace(-0.42, 0.42, 7) * length
     ribs = np.array([(a, b * (width / 2 - 0.004), height / 2) for a in x for b in (1, -1)])
@@ -253,7 +253,7 @@ def _quay(rng: np.random.Generator, palette: Palette, colours: list[int]) -> Mes
 
 
 def _ship(rng: np.random.Generator, palette: Palette, colours: list[int], dark: int) -> Mesh:
-    """Build a container ship along the quay, with its bow just past the crane and its containers astern."""
+    """Build a container ship along the quay, with its bow just past the crane and its containers aft."""
     hull = palette.add(
         painted_steel(rng, ((0.08, 0.12, 0.2), (0.3, 0.06, 0.05), (0.07, 0.2, 0.15))[int(rng.integers(3))])
     )

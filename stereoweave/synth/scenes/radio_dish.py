@@ -24,7 +24,7 @@ RIBS = 16
 
 
 def radio_dish(rng: np.random.Generator) -> Stage:
-    """Build a stage with a dish of 3.6 to 4.4 m that faces +x, and similar dishes in the distance."""
+    """Build a stage with a dish 3.6 to 4.4 m across that faces +x, and similar dishes in the distance."""
     palette = Palette()
     white, steel = palette.add(composite_skin(rng)), palette.add(galvanised_steel(rng))
     back = white if rng.random() < 0.5 else steel
@@ -55,7 +55,7 @@ def radio_dish(rng: np.random.Generator) -> Stage:
 
 
 def _far(rng: np.random.Generator, white: int, measures: tuple[float, float, float]) -> Mesh:
-    """Build simplified, distant dishes, given the radius, axis height and elevation."""
+    """Build simplified, distant dishes of the given radius, axis height and elevation."""
     radius, axis, upwards_deg = measures
     reflector = paraboloid(radius, 0.8 * radius, white, white, 20)
     dish = [

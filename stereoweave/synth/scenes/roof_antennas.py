@@ -15,7 +15,7 @@ SPOTS_M = np.array([(0.1, 0.2, 0), (0.7, -1.5, 0), (0.5, 1.7, 0), (-1.1, -0.8, 0
 
 
 def roof_antennas(rng: np.random.Generator) -> Stage:
-    """Build a stage with five antenna masts of 1.9 to 3.3 m."""
+    """Build a stage with five antenna masts, 1.9 to 3.3 m tall."""
     palette = Palette()
     steel, other = palette.add(galvanised_steel(rng)), palette.add(galvanised_steel(rng))
     grey = rng.uniform(0.5, 0.8)
@@ -92,7 +92,7 @@ def _tripod(steel: int) -> Mesh:
 
 
 def _roof(rng: np.random.Generator, palette: Palette, feet: np.ndarray, dark: int) -> Mesh:
-    """Build the house with its parapet, chimneys, vents, stair shed, cooling units and cables."""
+    """Build the house with its parapet, chimneys, vents, rooftop stairwell, cooling units and cables."""
     gravel = palette.add(
         Material(
             texture=str(rng.choice(["gravel", "asphalt", "concrete"])),
@@ -129,7 +129,7 @@ def _roof(rng: np.random.Generator, palette: Palette, feet: np.ndarray, dark: in
 
 
 def _windows(half_m: np.ndarray, dark: int, white: int) -> Mesh:
-    """Build rows of windows in the street walls."""
+    """Build rows of windows in the front and side walls."""
     y, z = (values.ravel() for values in np.meshgrid(np.linspace(-2.8, 2.8, 5), [-1.7, -4.2, -6.7]))
     x = np.full_like(y, half_m[0])
     front = np.stack([x, y, z], -1)
@@ -172,7 +172,7 @@ def _cooler(white: int, dark: int) -> Mesh:
 
 
 def _run(foot_m: np.ndarray, dark: int) -> Mesh:
-    """Build a cable on the roof from a mast to the stair shed."""
+    """Build a cable on the roof from a mast to the rooftop stairwell."""
     share = np.linspace(0, 1, 14)[:, None]
     path = foot_m + share * (np.array([-2.36, 1.1, 0.02]) - foot_m) + [0, 0, 0.012]
     path[:, 1] += 0.25 * np.sin(share[:, 0] * 2 * np.pi)

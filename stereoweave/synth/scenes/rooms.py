@@ -168,7 +168,7 @@ def _walls(rng: np.random.Generator, palette: Palette, cameras_deg: float, away_
 
 
 def _orbit_inside(rng: np.random.Generator, size_m: Float[np.ndarray, "3"]) -> Orbit:
-    """Return an arc around the room's centre, at eye level and as far from it as the walls allow."""
+    """Return an arc around the room's centre, at eye level and as far out as the walls allow."""
     azimuth_deg = rng.uniform(0, 360)
     angle = np.radians(np.linspace(azimuth_deg, azimuth_deg + _SWING_DEG, 9))
     to_wall_m = np.minimum(size_m[0] / 2 / abs(np.cos(angle)), size_m[1] / 2 / abs(np.sin(angle))).min()

@@ -27,7 +27,7 @@ from stereoweave.synth.world import Colour, Material, Mesh, join_meshes
 
 
 def ship(rng: np.random.Generator) -> Stage:
-    """Build a stage with a ship of 7 to 8.5 m, most or all of which is in the picture."""
+    """Build a stage with a ship 7 to 8.5 m long, most or all of which is in the picture."""
     palette = Palette()
     plan = TRADES[str(rng.choice(list(TRADES)))](rng)
     heel = rotation((1, 0, 0), rng.normal(0, 0.8)) @ rotation((0, 1, 0), rng.normal(0, 0.6))

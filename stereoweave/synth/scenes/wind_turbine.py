@@ -53,7 +53,7 @@ class TurbinePlan:
     Attributes:
         foot_m: Height of the tower's foot, which is on the ground or, at sea, on a platform.
         hub_m: Height of the tower's top.
-        radii_m: Radii of the tower at its foot and top; half the widths of a lattice tower.
+        radii_m: Radii of the tower at its foot and top; for a lattice tower, half its widths there.
     """
 
     kind: str
@@ -64,7 +64,7 @@ class TurbinePlan:
 
 
 def wind_turbine(rng: np.random.Generator) -> Stage:
-    """Build a stage with a turbine about 6.5 m high, whose rotor faces +x, or with a wind pump of 5 m."""
+    """Build a stage with a turbine about 6.5 m high, whose rotor faces +x, or a wind pump about 5 m high."""
     kind = str(rng.choice(list(KINDS), p=list(KINDS.values())))
     return _wind_pump(rng) if kind == "pump" else _turbine(rng, kind)
 
@@ -311,7 +311,7 @@ def _davit(top_m: float, yellow: int, materials: TurbineMaterials) -> Mesh:
 
 
 def _far(rng: np.random.Generator, plan: TurbinePlan, materials: TurbineMaterials, base: int) -> Mesh:
-    """Build simplified, distant turbines of the wind farm, facing the same way."""
+    """Build simplified, distant turbines of the wind farm, facing the same way as the near one."""
     tower = lathe([(1.1 * plan.radii_m[0], -0.3), (1.1 * plan.radii_m[0], plan.foot_m + 0.1)], base, 12)
     tube = lathe([(plan.radii_m[0], plan.foot_m), (plan.radii_m[1], plan.hub_m)], materials.white, 12)
     at = draw_spots(rng, int(rng.integers(3, 7)), 16, 75)

@@ -43,7 +43,7 @@ _PACKAGES = ("moderngl", "numpy", "opencv-python-headless", "pillow", "scikit-im
 
 @runtime_checkable
 class PairMaker(Protocol):
-    """Protocol for makers of pairs, which are pickled and sent to worker processes."""
+    """Protocol for pair makers, which are pickled and sent to worker processes."""
 
     def renderer(self) -> str:
         """Return the renderer's name.
@@ -57,7 +57,7 @@ class PairMaker(Protocol):
 
 @dataclass(frozen=True)
 class PairRenderer:
-    """A maker of pairs that uses this machine's best renderer; `plain` turns all effects off."""
+    """A pair maker that uses this machine's best renderer; `plain` turns all effects off."""
 
     plain: bool = False
 
@@ -76,10 +76,10 @@ class StorageFormat(NamedTuple):
     """A layout for storing pairs in a folder.
 
     Attributes:
-        whole_pairs: Function that returns the numbers of a scene's complete pairs.
+        whole_pairs: Function that returns the indices of a scene's complete pairs.
         write: Function that writes a run of pairs as they arrive.
         remove_unfinished: Function that deletes partly written files.
-        pairs_a_run: Greatest number of pairs that a worker makes in one task; no run crosses a multiple of
+        pairs_a_run: Maximum number of pairs that a worker makes in one task; no run crosses a multiple of
             this number.
     """
 
@@ -116,7 +116,7 @@ def make(  # noqa: PLR0913 - mirrors the command's options
     Raises:
         StereoweaveError: An argument is invalid; `out` holds another set, is in use or cannot be written; the
             disk is full; a worker was killed; or a machine does not see `out` or would make different pairs.
-            Even then, all finished pairs are complete, and the same call resumes the work.
+            Even then, the pairs already written are intact, and the same call resumes the work.
     """
     _check(spec, pairs, layout)
     make_folder(out)

@@ -34,7 +34,7 @@ _LOOK_WIDTH_PX = 160
 
 @runtime_checkable
 class SceneRenderer(Protocol):
-    """Protocol for renderers of worlds: `OpenGLRenderer`, and `Raycaster`, which is slower and plainer."""
+    """Protocol for renderers of worlds: `OpenGLRenderer`, and the slower `Raycaster` with fewer effects."""
 
     @property
     def name(self) -> str: ...

@@ -82,8 +82,8 @@ def run_in_engine(  # noqa: PLR0913 - see `run_in_workers`
     """Do all tasks on a cluster and repeat the tasks of killed workers.
 
     Args:
-        make_work: Function called once in each worker. It returns the function that does a task and
-            returns the task's number of steps.
+        make_work: Function called once in each worker; the function that it returns does a task and returns
+            the task's number of steps.
         tasks: Arguments of the returned function, one for each call.
         engine: Cluster that runs the workers.
         console: Console that shows the progress.

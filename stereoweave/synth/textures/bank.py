@@ -49,7 +49,7 @@ class TextureFamily:
     """Family of similar textures.
 
     Attributes:
-        variants: one procedure per texture.
+        variants: for each texture, the function that draws it.
         albedo: range of the mean colour in linear light, from 0 (black) to 1 (white); None keeps the colours
             as drawn.
     """
@@ -170,7 +170,7 @@ def srgb_to_linear(levels: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]
 
 
 def _scale_to_albedo(colours: Colours, albedo: float) -> Colours:
-    """Scale sRGB colours until their mean in linear light equals the albedo."""
+    """Scale sRGB colours so that their mean in linear light equals the albedo."""
     few, gain = colours[::4, ::4], 1.0
     # Linear light is about the 2.2nd power of the levels. Clipping changes the mean, hence the iterations.
     for _ in range(6):

@@ -34,7 +34,7 @@ def rust(rng: np.random.Generator) -> Texture:
 
 
 def paint(rng: np.random.Generator) -> Texture:
-    """Draw old, nearly white, dirty paint with chips that have rusty rims and streaks."""
+    """Draw old, dirty, nearly white paint, chipped, with rust around the chips and streaks below them."""
     broad, edge = noise(rng, 1.5, 3), noise(rng, 1.0, 14)
     damage = noise(rng, 1.6, 5) + 0.45 * edge
     limit = rng.uniform(2.2, 3.1)

@@ -39,7 +39,10 @@ def coursed_wall(rng: np.random.Generator) -> Texture:
 
 
 def _lay_courses(rng: np.random.Generator) -> tuple[np.ndarray, Map, int]:
-    """Return the blocks' labels, the distance to the nearest joint in texels, and the number of blocks."""
+    """Return maps of the block labels and of the distance to the nearest joint, and the number of blocks.
+
+    Distances are in texels.
+    """
     heights = rng.choice([2, 3, 4], 12)
     edges = np.round(np.concatenate([[0], np.cumsum(heights)]) * SIDE / heights.sum()).astype(int)
     label = np.zeros((SIDE, SIDE), int)

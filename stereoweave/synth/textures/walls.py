@@ -130,7 +130,7 @@ def brickwork(rng: np.random.Generator) -> Texture:
 
 
 def near_plain(rng: np.random.Generator) -> Texture:
-    """Draw a nearly white, even surface with almost no texture to match."""
+    """Draw an even, nearly white surface with almost no texture for stereo matching."""
     broad, fine = noise(rng, 1.5, 1), noise(rng, 0.8, 6)
     share = rng.uniform(0.008, 0.02)
     grey = 226 * (1 + share * (0.8 * broad + 0.6 * fine))

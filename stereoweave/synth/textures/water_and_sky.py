@@ -37,7 +37,7 @@ def cirrus(rng: np.random.Generator) -> Texture:
 
 
 def overcast(rng: np.random.Generator) -> Texture:
-    """Draw the density of an overcast sky with folds and thin places."""
+    """Draw the density of an overcast sky with folds and thin patches."""
     folds = warp(noise(rng, 1.6, 3, stretch=(1, 2)), 25 * noise(rng, 1.9, 2), 25 * noise(rng, 1.9, 2))
     return _density(np.clip(0.72 + 0.13 * folds + 0.03 * noise(rng, 1.1, 8), 0, 1))
 
