@@ -111,7 +111,7 @@ def test_getters_return_what_was_set():
 
 @pytest.mark.parametrize(("least", "count"), [(0, 0), (0, 2048), (2000, 48), (-2047, 1)])
 def test_a_range_that_int16_does_not_hold_is_refused(least, count):
-    with pytest.raises(StereoweaveError, match="between -2046 and 2047 px"):
+    with pytest.raises(StereoweaveError, match="from -2046 to 2047 px"):
         StereoMatcher(least, count)
     with pytest.raises(StereoweaveError, match=f"numDisparities {count}"):
         matcher = StereoMatcher(min(least, 0), 1)

@@ -123,4 +123,4 @@ def test_the_command_writes_and_shows_a_row_for_each_variant(tmp_path, monkeypat
 
 def test_a_network_that_is_not_shipped_has_no_file_to_compare(capsys):
     assert cli.main(["bench", "parity", str(ROOT / "checkpoints/fast_depth.pt")]) == 2
-    assert "expected base or small" in capsys.readouterr().err
+    assert "expected base, small" in capsys.readouterr().err
