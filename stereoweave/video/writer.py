@@ -1,4 +1,4 @@
-"""Writing of the parts of a video, and joining of the parts with the sound.
+"""Write a video in parts, then join the parts and add the sound.
 
 A part is a NUT file, which stores frame times exactly for any time base. Parts are joined packet by packet,
 so nothing is encoded twice, and sound is copied bit for bit.

@@ -39,9 +39,9 @@ class Batches(Dataset[dict[str, torch.Tensor]]):
     def key(self, step: int, part: int) -> tuple[int, ...]:
         """Return the seed for all random numbers of a micro-batch.
 
-        Trailing zeros do not change a seed, so the first micro-batch has the same random numbers as
-        (seed, step), which was the seed of a whole step before micro-batches existed. The third number is 0
-        and the last one even, because other values seed the order of the pairs and the choice of sets.
+        The seed is (seed, step, 0, 2 * part). Trailing zeros do not change a seed, so the first micro-batch
+        gets the same random numbers as a whole step did before micro-batches existed. Seeds with another
+        third number, or an odd fourth one, are those of the order of the pairs and of the choice of sets.
         """
         return self.recipe.seed, step, 0, 2 * part
 

@@ -54,7 +54,7 @@ class WeaveSize:
         warps: Whether the other view is warped once for the correlation at 1/2 resolution, instead of being
             sampled for each offset.
         refinement: Number of 3x3 convolutions in the refinement at 1/2 resolution.
-        neighbours: Number of old pixels that are combined into an upsampled pixel, 9 or 4.
+        neighbours: Number of low-resolution pixels that are combined into each upsampled pixel, 9 or 4.
         wider: Number of channels of the context at 1/32 resolution; 0 omits this context.
         completion: Number of channels of the stage at 1/4 resolution that completes occluded areas; 0 omits
             this stage.

@@ -15,7 +15,7 @@ class StepSums:
 
     PyTorch's DistributedDataParallel adds gradients in float32. Such sums depend on the order of addition,
     and therefore on the number of processes: losses differ by 1 % after 50 steps of a small network. Here,
-    gradients are added in float64. After rounding back to float32, only one in millions of values
+    gradients are added in float64. After rounding back to float32, only about one value in millions
     depends on the order.
     """
 

@@ -156,8 +156,8 @@ def _check_recipe(recipe: Recipe) -> None:
         )
     if recipe.micro_batches % read_rank().world_size:
         raise FormatError(
-            f"{recipe.name}: micro-batches per step: expected a multiple of the {read_rank().world_size} "
-            f"processes, found {recipe.micro_batches}; set micro_batch or --nproc-per-node"
+            f"{recipe.name}: micro-batches per step: expected a multiple of {read_rank().world_size}, "
+            f"the number of processes, found {recipe.micro_batches}; set micro_batch or --nproc-per-node"
         )
 
 

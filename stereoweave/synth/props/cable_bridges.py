@@ -118,7 +118,7 @@ def _fork_m(plan: BridgePlan, top_m: float) -> float:
 
 
 def _inset(plan: BridgePlan, z: np.ndarray, top_m: float) -> np.ndarray:
-    """Return how far from the axis cables are anchored to an inverted-Y tower at the heights z."""
+    """Return the distances from the axis at which cables meet an inverted-Y tower at the heights z."""
     fork_m = _fork_m(plan, top_m)
     return 0.05 + np.clip((fork_m - z) / (fork_m - 0.2), 0, 1) * (plan.side_m + 0.25)
 

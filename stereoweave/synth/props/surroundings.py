@@ -197,13 +197,13 @@ def rocks(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
 
 
 def houses(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
-    """Build houses of two kinds at the spots, with gable roofs, windows, doors and chimneys."""
+    """Build houses of two kinds at the given positions, with gable roofs, windows, doors and chimneys."""
     kinds = [_house(rng, palette) for _ in range(2)]
     return _scatter(rng, kinds, spots, rng.uniform(0.9, 1.25, len(spots)))
 
 
 def posts(rng: np.random.Generator, palette: Palette, spots: Spots, height_m: float = 1.2) -> Mesh:
-    """Build wooden posts at the spots."""
+    """Build wooden posts at the given positions."""
     wood = palette.add(Material(texture="wood", variant=int(rng.integers(64)), tint=(1.0, 0.95, 0.9)))
     tops = spots + np.array([0, 0, height_m]) + rng.normal(0, 0.03, (len(spots), 3))
     return tubes(spots - [0, 0, 0.5], tops, rng.uniform(0.06, 0.1, len(spots)), wood, sides=8)

@@ -116,7 +116,7 @@ def test_a_step_that_cannot_be_divided_among_the_ranks_is_refused_before_anythin
         monkeypatch.setenv(name, value)
     message = complaint(training.train_recipe, PARTED, tmp_path / "run", QUIET)
     assert message == (
-        "tiny: micro-batches per step: expected a multiple of the 3 processes, found 4; "
+        "tiny: micro-batches per step: expected a multiple of 3, the number of processes, found 4; "
         "set micro_batch or --nproc-per-node"
     )
     assert not list(tmp_path.iterdir())
