@@ -123,10 +123,7 @@ def make_app(
     if limits.hosts is not None:
         app.add_middleware(TrustedHostMiddleware, allowed_hosts=limits.hosts, www_redirect=False)
 
-    @app.exception_handler(RequestValidationError)
-    async def _refuse(_: Request, error: RequestValidationError) -> Response:
-        return JSONResponse({"detail": _join_errors(error)}, 422)
-
+    app.add_exception_handler(RequestValidationError, _refuse)
     respond = _Responder(answer_job, limits.megapixels, folder)
 
     @app.post(
@@ -162,6 +159,11 @@ def make_app(
             return Response(generate_latest(registry), media_type="text/plain; version=0.0.4")
 
     return app
+
+
+async def _refuse(_: Request, error: Exception) -> Response:
+    assert isinstance(error, RequestValidationError)
+    return JSONResponse({"detail": _join_errors(error)}, 422)
 
 
 def _list_responses(*endings: str) -> dict[int | str, dict[str, Any]]:
