@@ -27,7 +27,7 @@ _LIKELY = np.array([0.05] * 5 + [0.3, 0.05, 0.03])
 _MOST_TURN_DEGREES = 20.0
 # Largest difference in focal length; a larger one is taken for a camera that moved forward.
 _MOST_SCALE = 0.07
-# Matches are selected anew by the fitted warps this many times: the first selection knows no distortion.
+# Number of times that the matches are selected by the fitted warps; the first selection ignores distortion.
 _SELECTIONS = 2
 _MOST_RESIDUAL_PX = 1.0
 _PIXELS_OF_RESIDUAL = 1_500_000
@@ -186,11 +186,12 @@ def _measure_sampson_px(warps: Warps, matches: Matches) -> Float[np.ndarray, " n
 def _check(parameters: Float[np.ndarray, " 8"], residual_px: float, width: int, height: int) -> None:
     largest_degrees = float(np.degrees(np.abs(parameters[:5]).max()))
     most_px = _MOST_RESIDUAL_PX * max(1.0, (width * height / _PIXELS_OF_RESIDUAL) ** 0.5)
-    scaled = abs(np.expm1(parameters[_LOG_SCALE])) > _MOST_SCALE
-    if residual_px > most_px or largest_degrees > _MOST_TURN_DEGREES or scaled:
+    scale = float(np.expm1(parameters[_LOG_SCALE]))
+    if residual_px > most_px or largest_degrees > _MOST_TURN_DEGREES or abs(scale) > _MOST_SCALE:
         raise StereoweaveError(
-            f"expected cameras side by side, rotated by less than {_MOST_TURN_DEGREES:.0f} degrees, found "
-            f"vertical errors of {residual_px:.1f} px after a rotation of {largest_degrees:.0f} degrees; "
+            f"expected cameras side by side, rotated by less than {_MOST_TURN_DEGREES:.0f} degrees and with "
+            f"less than {_MOST_SCALE:.0%} difference in scale, found vertical errors of {residual_px:.1f} px "
+            f"after a rotation of {largest_degrees:.0f} degrees, and a scale difference of {scale:+.0%}; "
             "take the pictures from two positions side by side, without moving forward",
             setting="rectify",
         )
