@@ -1,7 +1,7 @@
 """Scores of rectification on simulated hand-held pairs."""
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,21 +22,21 @@ class HandheldRow:
     Attributes:
         pair: Name of the original, and number of the pair.
         width_px, height_px: Size of the pictures.
-        before_px: Median vertical error at the true correspondences before rectification.
-        median_px, px95: Median and 95th percentile of the vertical error afterwards; NaN if refused.
+        vertical_error_before_px: Median vertical error at the true correspondences before rectification.
+        vertical_error_px, vertical_error_95_px: Median and 95th percentile afterwards; NaN if refused.
         lost_percent: Percentage of the left picture that is outside the rectified one.
-        seconds: Time of the fit.
+        fit_s: Time of the fit.
         refused: Why the pair was refused; empty if it was not.
     """
 
     pair: str
     width_px: int
     height_px: int
-    before_px: float
-    median_px: float = float("nan")
-    px95: float = float("nan")
+    vertical_error_before_px: float
+    vertical_error_px: float = float("nan")
+    vertical_error_95_px: float = float("nan")
     lost_percent: float = float("nan")
-    seconds: float = float("nan")
+    fit_s: float = float("nan")
     refused: str = ""
 
 
@@ -49,30 +49,26 @@ def score(made: HandheldPair) -> HandheldRow:
     """Rectify one pair, and measure its errors at the true correspondences."""
     height, width = made.pair.left.shape[:2]
     before_px = float(np.median(np.abs(made.left_px - made.right_px)[:, 1]))
+    row = HandheldRow(pair=made.name, width_px=width, height_px=height, vertical_error_before_px=before_px)
     start_s = time.perf_counter()
     try:
         warps, _ = fit_warps(made.pair)
     except StereoweaveError as error:
-        return HandheldRow(
-            pair=made.name, width_px=width, height_px=height, before_px=before_px, refused=str(error)
-        )
-    seconds = time.perf_counter() - start_s
+        return replace(row, refused=str(error))
+    fit_s = time.perf_counter() - start_s
     off_px = np.abs(warps.left.transform(made.left_px) - warps.right.transform(made.right_px))[:, 1]
-    return HandheldRow(
-        pair=made.name,
-        width_px=width,
-        height_px=height,
-        before_px=before_px,
-        median_px=float(np.median(off_px)),
-        px95=float(np.percentile(off_px, 95)),
+    return replace(
+        row,
+        vertical_error_px=float(np.median(off_px)),
+        vertical_error_95_px=float(np.percentile(off_px, 95)),
         lost_percent=_measure_lost_percent(warps.left),
-        seconds=seconds,
+        fit_s=fit_s,
     )
 
 
 def summarize(rows: list[HandheldRow]) -> str:
     """Describe how many pairs end below 0.5 px, and how many of these keep 90 % of the left picture."""
-    good = [row for row in rows if row.median_px < 0.5]
+    good = [row for row in rows if row.vertical_error_px < 0.5]
     kept = sum(row.lost_percent <= 10 for row in good)
     return f"{len(good)} of {len(rows)} pairs end under 0.5 px, and {kept} of these lose at most 10 %"
 

@@ -23,9 +23,9 @@ def original():
 @pytest.mark.parametrize("index", range(4))
 def test_a_hand_held_pair_ends_under_half_a_pixel_and_keeps_nine_tenths(original, index):
     row = score(take_again(original, index))
-    assert row.before_px > 5
-    assert row.median_px < 0.5
-    assert row.px95 < 1.5
+    assert row.vertical_error_before_px > 5
+    assert row.vertical_error_px < 0.5
+    assert row.vertical_error_95_px < 1.5
     assert row.lost_percent < 10
     assert row.refused == ""
 
