@@ -2,7 +2,6 @@ import csv
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -18,7 +17,7 @@ from stereoweave.data.shards import write_shard
 from stereoweave.learn import checkpoint
 from stereoweave.learn.data.sources import VALIDATION_SEED
 from stereoweave.learn.export.from_checkpoint import count_multiply_adds
-from stereoweave.learn.models import MODELS, build_network
+from stereoweave.learn.models import build_network
 from stereoweave.learn.recipe import read_recipe
 from stereoweave.learn.training.objective import build_objective
 
@@ -46,13 +45,6 @@ SCORES = [
     "flying_percent",
 ]
 QUIET = Console(quiet=True)
-
-
-@pytest.fixture(autouse=True)
-def models():
-    """Restore the networks after a test, because an ablation adds its own."""
-    with patch.dict(MODELS):
-        yield
 
 
 @pytest.fixture

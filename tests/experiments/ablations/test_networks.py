@@ -5,8 +5,7 @@ import torch
 from learn_examples import untrained
 from torch import nn
 
-from experiments.ablations.networks import VARIANTS, soft_argmax, upsample_bilinear
-from stereoweave.learn.models import MODELS
+from experiments.ablations.networks import VARIANTS, register_variants, soft_argmax, upsample_bilinear
 from stereoweave.learn.models.layers import local_soft_argmax
 from stereoweave.learn.training.losses import weave_losses
 
@@ -27,10 +26,9 @@ DIFFERENT = {
 
 
 @pytest.fixture(autouse=True)
-def registered(monkeypatch):
+def registered():
     """Let recipes name the variants."""
-    for name, network in VARIANTS.items():
-        monkeypatch.setitem(MODELS, name, network)
+    register_variants()
 
 
 @pytest.fixture(params=VARIANTS)

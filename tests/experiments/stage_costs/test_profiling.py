@@ -209,8 +209,7 @@ def test_an_ablations_checkpoint_is_measured_too(rows, tmp_path):
 def test_another_network_is_one_line_that_says_where_it_is_timed(tmp_path):
     recipe = recipe_of("fast_depth", target="disparity")
     checkpoint.save(checkpoint_of(untrained("fast_depth"), recipe), tmp_path / "last.pt")
-    with patch.dict(MODELS):
-        assert "expected a WeaveNet" in complaint(costs.measure_stage_costs, [tmp_path / "last.pt"])
+    assert "expected a WeaveNet" in complaint(costs.measure_stage_costs, [tmp_path / "last.pt"])
 
 
 def test_the_command_prints_the_table_and_writes_the_rows(rows, monkeypatch, tmp_path, capsys):
