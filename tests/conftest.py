@@ -64,6 +64,10 @@ CAPABILITIES = {
 # The value that `ray_engine.set_environment` sets before it imports Ray; tests import Ray earlier.
 os.environ["RAY_DEDUP_LOGS_SKIP_REGEX"] = ".*"
 
+# Stereoweave sets it to 0 when it starts Ray itself. A cluster started with it would listen only on the
+# loopback address, but the processes of the tests have imported Ray without it, and expect another address.
+LOOPBACK_ALONE = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
+
 # The garbage collector would traverse all imported modules repeatedly, for a quarter of the tests' time.
 gc.disable()
 
@@ -175,7 +179,7 @@ def ray_head(cpus: int, **variables: str) -> Iterator[str]:
         root = Path(__file__).parent.parent
         paths = [str(root), str(root / "tests" / "helpers"), *filter(None, [os.environ.get("PYTHONPATH")])]
         with log.open("wb") as out:
-            environment = os.environ | {
+            environment = {name: value for name, value in os.environ.items() if name != LOOPBACK_ALONE} | {
                 # A token in the user's home folder would otherwise be required.
                 "RAY_AUTH_MODE": "disabled",
                 # With usage reports turned off, the head node would still report that they are off.
