@@ -52,7 +52,7 @@ def score(made: HandheldPair) -> HandheldRow:
     row = HandheldRow(pair=made.name, width_px=width, height_px=height, vertical_error_before_px=before_px)
     start_s = time.perf_counter()
     try:
-        warps, _ = fit_warps(made.pair)
+        warps = fit_warps(made.pair).warps
     except StereoweaveError as error:
         return replace(row, refused=str(error))
     fit_s = time.perf_counter() - start_s

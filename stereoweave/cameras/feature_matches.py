@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Bool, Float, Float32, UInt8
 
 # Corners are detected and matched in copies of at most this many pixels.
 _PIXELS = 1_500_000
@@ -47,6 +47,10 @@ class Matches(NamedTuple):
     def lower_px(self) -> Float[np.ndarray, " n"]:
         """Distance in px by which each match is lower in the right picture; 0 in a rectified pair."""
         return self.right_px[:, 1] - self.left_px[:, 1]
+
+    def select(self, kept: Bool[np.ndarray, " n"]) -> "Matches":
+        """Return the matches of a mask."""
+        return Matches(self.left_px[kept], self.right_px[kept])
 
 
 def find_matches(

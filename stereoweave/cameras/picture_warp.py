@@ -1,10 +1,12 @@
-"""Warp of one picture: removes radial distortion, then applies a homography."""
+"""Warp of one picture: removes radial distortion, applies a homography, then moves parts up or down."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
+
+from stereoweave.cameras.row_field import RowField
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,24 +22,31 @@ class PictureWarp:
         homography: [3, 3], maps undistorted to warped pixels.
         distortion: Lens distortion; positive values move points towards the centre, and 0 moves none.
         size_px: Width and height of the picture, both before and after the warp.
+        field: Vertical errors that the homography leaves, if known.
     """
 
     homography: Float[np.ndarray, "3 3"]
     distortion: float
     size_px: tuple[int, int]
+    field: RowField | None = None
 
     def transform(self, places_px: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
         """Map points of the source picture to their positions in the warped picture."""
         undistorted = undistort(places_px, self.distortion, self.size_px)
-        return cv2.perspectiveTransform(undistorted[None], self.homography)[0]
+        moved_px = cv2.perspectiveTransform(undistorted[None], self.homography)[0]
+        return self.field.align(moved_px) if self.field else moved_px
 
     def shifted(self, shift_px: tuple[float, float]) -> "PictureWarp":
-        """Return this warp followed by a shift to the right and down."""
+        """Return this warp, whose homography is followed by a shift to the right and down."""
         shift = np.eye(3)
         shift[:2, 2] = shift_px
-        return PictureWarp(
-            homography=shift @ self.homography, distortion=self.distortion, size_px=self.size_px
-        )
+        return replace(self, homography=shift @ self.homography)
+
+    def scaled(self, factor: float) -> "PictureWarp":
+        """Return this warp, whose homography is followed by a change of size about the centre."""
+        about_centre = np.diag([factor, factor, 1.0])
+        about_centre[:2, 2] = (1 - factor) * (np.array(self.size_px) - 1) / 2
+        return replace(self, homography=about_centre @ self.homography)
 
     def apply(
         self, image: UInt8[np.ndarray, "h w 3"], seen: Bool[np.ndarray, "h w"] | None
@@ -54,6 +63,8 @@ class PictureWarp:
         width, height = self.size_px
         inverse = np.linalg.inv(self.homography).astype(np.float32)
         x, y = np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)[:, None]
+        if self.field:
+            y = y + self.field.measure_everywhere_px()
         u, v, scale = (row[0] * x + row[1] * y + row[2] for row in inverse)
         u, v = u / scale - (width - 1) / 2, v / scale - (height - 1) / 2
         squares = (u * u + v * v) / np.float32(_half_diagonal_px(self.size_px) ** 2)

@@ -1,0 +1,147 @@
+"""Fit of two rotated cameras with the same lens to feature matches."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from stereoweave.cameras.feature_matches import Matches
+from stereoweave.cameras.picture_warp import PictureWarp, undistort
+
+# The fit starts from each of these distortions: none, and those of wide lenses.
+_DISTORTIONS = (0.0, -0.25, -0.5)
+_MOST_DISTORTION = 0.9
+_STEPS = 25
+# The fit ends when a step improves the loss by less than this share.
+_LEAST_GAIN = 1e-6
+_STEP = 1e-6
+# Scale of the robust loss.
+_SOFT_PX = 0.5
+# Standard deviations of the prior: of the angles in radians, of log(focal length / width), of log(scale) and
+# of the distortion. Where the matches do not determine the solution, the prior selects the smallest change.
+_LIKELY = np.array([0.05] * 5 + [0.3, 0.05, 0.1])
+_ANGLES, _LOG_FOCAL, _LOG_SCALE, _DISTORTION = slice(0, 5), 5, 6, 7
+
+
+class Warps(NamedTuple):
+    """Warps of both pictures, after which corresponding rows coincide."""
+
+    left: PictureWarp
+    right: PictureWarp
+
+    def transform(self, matches: Matches) -> Matches:
+        """Return the matches' positions in the warped pictures."""
+        return Matches(self.left.transform(matches.left_px), self.right.transform(matches.right_px))
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraFit:
+    """Parameters of two cameras that took a pair.
+
+    The left camera is rotated by yaw and roll, and the right one by pitch, yaw and roll. A common pitch does
+    not change the alignment of rows, so the left camera has none. Both lenses have the same distortion.
+
+    Attributes:
+        parameters: left yaw and roll, right pitch, yaw and roll in radians, log(focal length / width), log of
+            the right focal length divided by the left one, and the distortion (see `PictureWarp`).
+        size_px: Width and height of the pictures.
+    """
+
+    parameters: Float[np.ndarray, " 8"]
+    size_px: tuple[int, int]
+
+    @property
+    def largest_degrees(self) -> float:
+        return float(np.degrees(np.abs(self.parameters[_ANGLES]).max()))
+
+    @property
+    def scale(self) -> float:
+        """Size of the right picture's content, divided by that of the left one's."""
+        return float(np.exp(self.parameters[_LOG_SCALE]))
+
+    @property
+    def distortion(self) -> float:
+        return float(self.parameters[_DISTORTION])
+
+    def make_warps(self) -> Warps:
+        """Return the warps that turn both cameras to a common direction, and remove the distortion."""
+        left_yaw, left_roll, right_pitch, right_yaw, right_roll = self.parameters[_ANGLES]
+        left, _ = cv2.Rodrigues(np.array([0.0, left_yaw, left_roll]))
+        right, _ = cv2.Rodrigues(np.array([right_pitch, right_yaw, right_roll]))
+        width, height = self.size_px
+        focal_px = width * np.exp(self.parameters[_LOG_FOCAL])
+        camera = np.array([[focal_px, 0, (width - 1) / 2], [0, focal_px, (height - 1) / 2], [0, 0, 1]])
+        right_camera = camera.copy()
+        right_camera[[0, 1], [0, 1]] *= self.scale
+        homographies = (camera @ left @ np.linalg.inv(camera), camera @ right @ np.linalg.inv(right_camera))
+        return Warps(
+            *(
+                PictureWarp(homography=homography, distortion=self.distortion, size_px=self.size_px)
+                for homography in homographies
+            )
+        )
+
+    def measure_sampson_px(self, matches: Matches) -> Float[np.ndarray, " n"]:
+        """Return Sampson errors: first-order distances from the epipolar lines, in undistorted px."""
+        warps = self.make_warps()
+        across = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+        fundamental = warps.right.homography.T @ across @ warps.left.homography
+        ones = np.ones((len(matches.left_px), 1))
+        left, right = (
+            np.hstack([undistort(places_px, self.distortion, self.size_px), ones]) for places_px in matches
+        )
+        lines_right, lines_left = left @ fundamental.T, right @ fundamental
+        squared = (lines_right[:, :2] ** 2).sum(1) + (lines_left[:, :2] ** 2).sum(1)
+        return (right * lines_right).sum(1) / np.sqrt(squared)
+
+
+def fit_cameras(matches: Matches, size_px: tuple[int, int], start: CameraFit | None = None) -> CameraFit:
+    """Fit two cameras to matches of which few are wrong.
+
+    Args:
+        matches: The matches.
+        size_px: Width and height of the pictures.
+        start: Where the fit starts; default: several distortions, of which the best result is returned.
+    """
+    if start:
+        return _fit_from(start, matches)[0]
+    starts = (
+        CameraFit(parameters=np.array([0.0] * _DISTORTION + [distortion]), size_px=size_px)
+        for distortion in _DISTORTIONS
+    )
+    return min((_fit_from(start, matches) for start in starts), key=lambda found: found[1])[0]
+
+
+def _fit_from(fit: CameraFit, matches: Matches) -> tuple[CameraFit, float]:
+    """Minimise the robust loss by Levenberg-Marquardt with numeric derivatives; return fit and loss."""
+    missed, damping = _list_errors(fit, matches), 1e-3
+    for _ in range(_STEPS):
+        moves = _STEP * np.eye(len(fit.parameters))
+        slopes = np.stack([(_list_errors(_move(fit, move), matches) - missed) / _STEP for move in moves], 1)
+        normal = slopes.T @ slopes
+        step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), slopes.T @ missed)
+        tried = _move(fit, step)
+        errors = _list_errors(tried, matches)
+        gain = missed @ missed - errors @ errors
+        if abs(tried.distortion) > _MOST_DISTORTION or not gain > 0:
+            damping *= 10
+            continue
+        done = gain < _LEAST_GAIN * (missed @ missed)
+        fit, missed, damping = tried, errors, damping / 10
+        if done:
+            break
+    return fit, float(missed @ missed)
+
+
+def _move(fit: CameraFit, step: Sequence[float] | Float[np.ndarray, " 8"]) -> CameraFit:
+    return replace(fit, parameters=fit.parameters + step)
+
+
+def _list_errors(fit: CameraFit, matches: Matches) -> Float[np.ndarray, " n"]:
+    """Return the roots of the terms of the loss: one for each match, and one for each parameter's prior."""
+    missed_px = fit.measure_sampson_px(matches)
+    softened = np.sign(missed_px) * _SOFT_PX * np.sqrt(np.log1p((missed_px / _SOFT_PX) ** 2))
+    return np.concatenate([softened, fit.parameters / _LIKELY])
