@@ -111,6 +111,7 @@ def test_a_pair_with_different_exposures_is_advised_to_lock_them():
         vertical_error_95_px=0.3,
         vertical_shift_px=0.0,
         rotation_degrees=0.0,
+        scale=1.0,
         range_px=(5.0, 60.0),
         exposure_ratio=2.0,
         defects=("exposure",),

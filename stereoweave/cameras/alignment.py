@@ -10,18 +10,23 @@ from jaxtyping import Bool, Float, UInt8
 
 from stereoweave.cameras.disparity_sign import estimate_depth_order, find_negative_disparities
 from stereoweave.cameras.feature_matches import Matches, find_matches
+from stereoweave.cameras.vertical_errors import VerticalErrors, fit_vertical_errors
 from stereoweave.errors import Note, Remedy
 
 Defect = Literal[
     "too_few_matches",
+    "unrelated",
+    "same_picture",
     "swapped",
     "vertical_shift",
     "rotation",
+    "scale",
     "not_rectified",
     "exposure",
     "negative_disparity",
 ]
 DEFECTS: tuple[Defect, ...] = get_args(Defect)
+ROW_DEFECTS: tuple[Defect, ...] = ("vertical_shift", "rotation", "scale", "not_rectified")
 
 SWAPPED = Note("left and right are swapped", Remedy("give them the other way round"))
 _RECTIFY = Remedy("rectify the pair", ("rectify",))
@@ -32,11 +37,7 @@ _TOLERATED_DEGREES = 0.3
 _TOLERATED_STOPS = 0.58
 _PIXELS_OF_TOLERANCE = 1_500_000
 
-# Inliers lie within this distance of the fitted field of vertical errors.
-_INLIER_PX = 1.5
-_FIRST_INLIER_PX = 2.5
-_TRIALS, _POLISHING = 400, 6
-_LEAST_MATCHES, _LEAST_INLIER_SHARE = 20, 0.2
+_LEAST_MATCHES = 20
 # A match's disparity counts if it agrees with the disparities of at least this many neighbours.
 _NEIGHBOURS, _LEAST_AGREEING = 8, 4
 _AGREE_PX, _AGREE_SHARE = 2.0, 0.05
@@ -46,6 +47,11 @@ _OUTER_PERCENT = 1.0
 _LIGHT_WINDOW_PX = 7
 _BLACK_LEVEL, _WHITE_LEVEL = 8, 250
 _GAMMA = 2.2
+
+# A pair whose disparities are all smaller than this shows no depth.
+_LEAST_PARALLAX_PX = 0.5
+# Texture is measured in windows of this size; pictures have texture if this share of them has.
+_TEXTURE_WINDOW_PX, _TEXTURED_LEVELS, _LEAST_TEXTURED_SHARE = 9, 2.0, 0.2
 
 # The vote on the depth order must be this clear to overrule the signs of the disparities.
 _CLEAR_VOTE = 0.15
@@ -60,6 +66,7 @@ class Alignment:
         vertical_error_px, vertical_error_95_px: Median and 95th percentile of the vertical error.
         vertical_shift_px: Vertical shift of the right image at its centre; positive if that image is lower.
         rotation_degrees: Clockwise rotation of the right image.
+        scale: Size of the right image's content divided by that of the left one's.
         range_px: Least and greatest disparity, without the outermost 1 % at each end.
         exposure_ratio: Exposure of the right image divided by that of the left image; NaN if unknown.
         defects: Names of the defects found, from `DEFECTS`; empty for a sound pair.
@@ -70,14 +77,25 @@ class Alignment:
     vertical_error_95_px: float
     vertical_shift_px: float
     rotation_degrees: float
+    scale: float
     range_px: tuple[float, float]
     exposure_ratio: float
     defects: tuple[Defect, ...]
 
+    @property
+    def is_known(self) -> bool:
+        """Whether enough points match; if not, all numbers but `matches` are NaN."""
+        return not math.isnan(self.vertical_error_px)
+
+    @property
+    def is_rectified(self) -> bool:
+        """Whether enough points match, and all corresponding points lie in the same image rows."""
+        return self.is_known and not set(self.defects) & set(ROW_DEFECTS)
+
     def lines(self) -> list[Note]:
         """Return all findings as notes, with remedies for the defects."""
-        if "too_few_matches" in self.defects:
-            return [self._note("too_few_matches")]
+        if not self.is_known:
+            return self.warnings()
         least_px, greatest_px = self.range_px
         exposure = f"the right picture has {self.exposure_ratio:.2f} times the exposure of the left one"
         if math.isnan(self.exposure_ratio):
@@ -100,28 +118,25 @@ class Alignment:
         match defect:
             case "too_few_matches":
                 return Note(
+                    f"expected pictures with more texture, found {self.matches} matching points; the "
+                    "alignment of plain pictures cannot be checked"
+                )
+            case "unrelated":
+                return Note(
                     f"expected two pictures of the same scene, found {self.matches} matching points; the "
-                    "pictures may be too plain, too different or taken from points too far apart"
+                    "pictures show different scenes, or were taken from points too far apart",
+                    Remedy("give the two pictures of one pair"),
+                )
+            case "same_picture":
+                return Note(
+                    "left and right show the same view: all disparities are "
+                    f"{self.range_px[0]:.1f} to {self.range_px[1]:.1f} px, so no depth can be seen",
+                    Remedy("give two pictures from two positions"),
                 )
             case "swapped":
                 return SWAPPED
-            case "vertical_shift":
-                lower = "lower" if self.vertical_shift_px > 0 else "higher"
-                return Note(
-                    f"the right picture is {abs(self.vertical_shift_px):.1f} px {lower} than the left one",
-                    _RECTIFY,
-                )
-            case "rotation":
-                way = "clockwise" if self.rotation_degrees > 0 else "anticlockwise"
-                return Note(
-                    f"the right picture is rotated {abs(self.rotation_degrees):.1f} degrees {way}", _RECTIFY
-                )
-            case "not_rectified":
-                return Note(
-                    "the pair is not rectified: vertical errors vary over the picture, and 95 % of them are "
-                    f"below {self.vertical_error_95_px:.1f} px",
-                    _RECTIFY,
-                )
+            case "vertical_shift" | "rotation" | "scale" | "not_rectified":
+                return Note(self._describe_rows(defect), _RECTIFY)
             case "exposure":
                 ratio = max(self.exposure_ratio, 1 / self.exposure_ratio)
                 which = "right" if self.exposure_ratio > 1 else "left"
@@ -136,57 +151,84 @@ class Alignment:
                     "this, but metric depth requires doffs besides focal length and baseline"
                 )
 
+    def _describe_rows(self, defect: Defect) -> str:
+        match defect:
+            case "vertical_shift":
+                lower = "lower" if self.vertical_shift_px > 0 else "higher"
+                return f"the right picture is {abs(self.vertical_shift_px):.1f} px {lower} than the left one"
+            case "rotation":
+                way = "clockwise" if self.rotation_degrees > 0 else "anticlockwise"
+                return f"the right picture is rotated {abs(self.rotation_degrees):.1f} degrees {way}"
+            case "scale":
+                which = "larger" if self.scale > 1 else "smaller"
+                return f"the right picture is {100 * abs(self.scale - 1):.1f} % {which} than the left one"
+        return (
+            "the pair is not rectified: vertical errors vary over the picture, and 95 % of them are below "
+            f"{self.vertical_error_95_px:.1f} px"
+        )
+
 
 def check_pair(left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"]) -> Alignment:
     """Measure the alignment of a pair, rectified or not.
 
     This takes 0.1 to 0.2 s at 640x480.
     """
-    matches = find_matches(left, right)
+    found = find_matches(left, right)
     scale = max(1.0, (left.shape[0] * left.shape[1] / _PIXELS_OF_TOLERANCE) ** 0.5)
-    count = len(matches.left_px)
+    count = len(found.left_px)
     centre_px = (np.array(right.shape[1::-1]) - 1) / 2
-    field = _fit_vertical_error(matches, centre_px, scale) if count >= _LEAST_MATCHES else None
-    if field is None:
-        return _make_unrelated(count)
-    inliers, shift_px, slope, uneven_px = field
-    matches = Matches(matches.left_px[inliers], matches.right_px[inliers])
+    errors = fit_vertical_errors(found, centre_px, scale) if count >= _LEAST_MATCHES else None
+    if errors is None:
+        return _make_unknown(left, right, count)
+    matches = found.select(errors.inliers)
     # A rotation also moves the upper and lower parts of the picture sideways.
-    disparity_px = matches.disparity_px - slope * (matches.right_px[:, 1] - centre_px[1])
+    disparity_px = matches.disparity_px - errors.slope * (matches.right_px[:, 1] - centre_px[1])
     shared = _find_supported(matches, disparity_px, scale)
     disparity_px = disparity_px[shared]
     if len(disparity_px) < _LEAST_MATCHES:
-        return _make_unrelated(count)
-    small = _shrink(left, scale), _level(_shrink(right, scale), shift_px / scale, slope)
+        return _make_unknown(left, right, count)
+    small = _shrink(left, scale), _level(_shrink(right, scale), errors.shift_px / scale, errors.slope)
     negative_px = scale * find_negative_disparities(
         *small, matches.left_px[shared] / scale, disparity_px / scale
     )
     least_px, greatest_px = _measure_range(disparity_px, negative_px)
     ratio = _measure_light_ratio(left, right, matches)
-    # A rotation about a point other than the centre of the right picture also looks like a shift.
-    tolerated_px = scale * _TOLERATED_PX + abs(slope) * float(np.median(np.abs(disparity_px)))
-    is_present = {
-        "vertical_shift": abs(shift_px) > tolerated_px,
-        "rotation": abs(np.degrees(slope)) > _TOLERATED_DEGREES,
-        "not_rectified": uneven_px > 2 * scale * _TOLERATED_PX,
-        "exposure": abs(np.log2(ratio)) > _TOLERATED_STOPS,
-    }
-    if len(negative_px):
+    defects = _find_row_defects(errors, disparity_px, centre_px[1], scale)
+    if abs(np.log2(ratio)) > _TOLERATED_STOPS:
+        defects.add("exposure")
+    if max(-least_px, greatest_px) < scale * _LEAST_PARALLAX_PX:
+        defects.add("same_picture")
+    elif len(negative_px):
         order = estimate_depth_order(*small, (least_px / scale, greatest_px / scale))
         usual = _CLEAR_VOTE * (2 * float((disparity_px < 0).mean()) - 1)
         swapped = greatest_px < -least_px and order < usual
-        is_present["swapped" if swapped else "negative_disparity"] = True
+        defects.add("swapped" if swapped else "negative_disparity")
     rows_px = np.abs(matches.lower_px)
     return Alignment(
         matches=count,
         vertical_error_px=float(np.median(rows_px)),
         vertical_error_95_px=float(np.percentile(rows_px, 95)),
-        vertical_shift_px=shift_px,
-        rotation_degrees=float(np.degrees(slope)),
+        vertical_shift_px=errors.shift_px,
+        rotation_degrees=float(np.degrees(errors.slope)),
+        scale=1 / (1 - errors.growth),
         range_px=(least_px, greatest_px),
         exposure_ratio=ratio,
-        defects=tuple(defect for defect in DEFECTS if is_present.get(defect)),
+        defects=tuple(defect for defect in DEFECTS if defect in defects),
     )
+
+
+def _find_row_defects(
+    errors: VerticalErrors, disparity_px: Float[np.ndarray, " n"], half_height_px: float, scale: float
+) -> set[Defect]:
+    # A rotation about a point other than the centre of the right picture also looks like a shift.
+    tolerated_px = scale * _TOLERATED_PX + abs(errors.slope) * float(np.median(np.abs(disparity_px)))
+    is_present: dict[Defect, bool] = {
+        "vertical_shift": abs(errors.shift_px) > tolerated_px,
+        "rotation": abs(np.degrees(errors.slope)) > _TOLERATED_DEGREES,
+        "scale": abs(errors.growth) * half_height_px > 2 * scale * _TOLERATED_PX,
+        "not_rectified": errors.uneven_px > 2 * scale * _TOLERATED_PX,
+    }
+    return {defect for defect, present in is_present.items() if present}
 
 
 def _measure_range(
@@ -201,57 +243,29 @@ def _measure_range(
     return float(least_px), float(greatest_px)
 
 
-def _make_unrelated(matches: int) -> Alignment:
+def _make_unknown(
+    left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"], matches: int
+) -> Alignment:
+    """Return the alignment of a pair without enough matches: plain, or of two scenes."""
     nan = float("nan")
+    textured = min(_measure_textured_share(image) for image in (left, right)) > _LEAST_TEXTURED_SHARE
     return Alignment(
         matches=matches,
         vertical_error_px=nan,
         vertical_error_95_px=nan,
         vertical_shift_px=nan,
         rotation_degrees=nan,
+        scale=nan,
         range_px=(nan, nan),
         exposure_ratio=nan,
-        defects=("too_few_matches",),
+        defects=("unrelated" if textured else "too_few_matches",),
     )
 
 
-def _fit_vertical_error(
-    matches: Matches, centre_px: Float[np.ndarray, " 2"], scale: float
-) -> tuple[Bool[np.ndarray, " n"], float, float, float] | None:
-    """Fit the vertical error; return inliers, shift in px, slope and the size of the other terms in px.
-
-    The vertical error is modelled as a quadratic function of the position in the right picture. The constant
-    term is a shift, and the term in x is a rotation; scale, pitch and convergence cause the other terms.
-    Returns None if no such function explains enough matches.
-    """
-    x, y = ((matches.right_px - centre_px) / centre_px[0]).T
-    terms = np.stack([np.ones_like(x), x, y, x * y, x * x, y * y], axis=1)
-    lower_px = matches.lower_px
-    inliers = _find_plane_inliers(terms[:, :3], lower_px, scale * _FIRST_INLIER_PX)
-    for _ in range(_POLISHING):
-        # The ridge limits terms that only a few matches support.
-        weights, ridge = terms[inliers], 0.1 * np.eye(6)
-        field = np.linalg.solve(weights.T @ weights + ridge, weights.T @ lower_px[inliers])
-        inliers = np.abs(terms @ field - lower_px) <= scale * _INLIER_PX
-    if inliers.sum() < max(_LEAST_MATCHES, _LEAST_INLIER_SHARE * len(x)):
-        return None
-    uneven_px = np.abs(terms[inliers, 2:] @ field[2:])
-    return inliers, float(field[0]), float(field[1] / centre_px[0]), float(np.percentile(uneven_px, 95))
-
-
-def _find_plane_inliers(
-    terms: Float[np.ndarray, "n 3"], values: Float[np.ndarray, " n"], tolerated: float
-) -> Bool[np.ndarray, " n"]:
-    """Return the inliers of the best plane found by RANSAC; the zero plane is one of the candidates."""
-    rng = np.random.default_rng(0)
-    picked = rng.integers(0, len(values), (_TRIALS, 3))
-    through = terms[picked]
-    picked, through = (array[np.abs(np.linalg.det(through)) > 0.01] for array in (picked, through))
-    planes = np.linalg.solve(through, values[picked][..., None])[..., 0]
-    planes = np.concatenate([np.zeros((1, 3)), planes])
-    missed = np.minimum(np.abs(planes @ terms.T - values), tolerated)
-    best = missed.sum(1).argmin()
-    return missed[best] < tolerated
+def _measure_textured_share(image: UInt8[np.ndarray, "h w 3"]) -> float:
+    """Return the share of an image where grey levels vary."""
+    slope = cv2.Sobel(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), cv2.CV_32F, 1, 0, scale=1 / 8)
+    return float((cv2.blur(np.abs(slope), (_TEXTURE_WINDOW_PX,) * 2) > _TEXTURED_LEVELS).mean())
 
 
 def _find_supported(

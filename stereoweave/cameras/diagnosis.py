@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from stereoweave.cameras.alignment import check_pair
+from stereoweave.cameras.alignment import Alignment, check_pair
 from stereoweave.errors import Note, Remedy
 from stereoweave.stereo import Estimate, StereoPair
 
@@ -11,20 +11,27 @@ _CONFIDENT = 0.5
 _LEAST_CONFIDENT_PERCENT = 30.0
 
 
-def find_problems(pair: StereoPair, estimate: Estimate) -> list[Note]:
+def find_problems(pair: StereoPair, estimate: Estimate, alignment: Alignment | None = None) -> list[Note]:
     """Return notes on a pair's problems; a sound pair has none.
 
     The alignment is measured at feature matches (`stereoweave check` reports it in full). If there are too
     few matches, only the estimate's confidence decides, because a plain wall may be matched well.
+
+    Args:
+        pair: The pair.
+        estimate: The pair's estimate.
+        alignment: The pair's alignment, if it has been measured already.
     """
-    alignment = check_pair(pair.left, pair.right)
-    if "too_few_matches" not in alignment.defects:
+    alignment = alignment or check_pair(pair.left, pair.right)
+    if alignment.is_known:
         warnings = alignment.warnings()
         if warnings:
             return warnings
     seen = np.ones(estimate.confidence.shape, bool) if pair.left_seen is None else pair.left_seen
     confident_percent = 100 * float((estimate.confidence >= _CONFIDENT)[seen].mean()) if seen.any() else 0.0
     if confident_percent < _LEAST_CONFIDENT_PERCENT:
+        if "unrelated" in alignment.defects:
+            return alignment.warnings()
         return [
             Note(
                 f"only {confident_percent:.0f} % of the disparities are confident: the pictures may be too "

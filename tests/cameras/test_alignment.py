@@ -14,10 +14,10 @@ SEED = 77
 ALIKE = 2, 6
 
 
-def turned(photo, degrees):
-    """The photograph turned clockwise about its middle."""
+def turned(photo, degrees, scale=1.0):
+    """The photograph turned clockwise and scaled about its middle."""
     height, width = photo.shape[:2]
-    turn = cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), -degrees, 1)
+    turn = cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), -degrees, scale)
     return cv2.warpAffine(photo, turn, (width, height), borderMode=cv2.BORDER_REPLICATE)
 
 
@@ -33,6 +33,7 @@ ONE_DEFECT = {
     "swapped": lambda left, right: (right, left),
     "vertical_shift": lambda left, right: (cut(left, slice(2, None)), cut(right, slice(-2))),
     "rotation": lambda left, right: (left, turned(right, 1)),
+    "scale": lambda left, right: (left, turned(right, 0, scale=1.02)),
     "exposure": lambda left, right: (left, brighter(right, -1)),
 }
 
@@ -72,6 +73,8 @@ def test_measured_amounts_equal_the_simulated_ones(pairs):
     assert lower.vertical_error_px == pytest.approx(2, abs=0.3)
     assert check_pair(left, turned(right, 1)).rotation_degrees == pytest.approx(1, abs=0.1)
     assert check_pair(left, turned(right, -1)).rotation_degrees == pytest.approx(-1, abs=0.1)
+    assert check_pair(left, turned(right, 0, scale=1.03)).scale == pytest.approx(1.03, abs=0.002)
+    assert check_pair(left, turned(right, 0, scale=0.97)).scale == pytest.approx(0.97, abs=0.002)
     assert check_pair(left, brighter(right, -1)).exposure_ratio == pytest.approx(0.5, rel=0.1)
     assert check_pair(left, right).exposure_ratio == pytest.approx(1, rel=0.1)
 
@@ -85,6 +88,9 @@ def test_the_lines_say_what_to_do(pairs):
     assert lower.warnings() == lower.lines()[-1:]
     assert str(check_pair(left, turned(right, -1)).lines()[-1]) == (
         "the right picture is rotated 1.0 degrees anticlockwise; rectify the pair (rectify)"
+    )
+    assert str(check_pair(*ONE_DEFECT["scale"](left, right)).lines()[-1]) == (
+        "the right picture is 2.0 % larger than the left one; rectify the pair (rectify)"
     )
     assert "2.0 times the exposure of the other" in str(check_pair(left, brighter(right, -1)).lines()[-1])
     assert str(check_pair(right, left).lines()[-1]).startswith("left and right are swapped")
@@ -100,13 +106,25 @@ def test_convergence_is_named_as_rows_that_do_not_match(pairs):
     assert "not_rectified" in check_pair(left, toed_in).defects
 
 
-def test_pictures_of_two_scenes_and_plain_ones_have_too_few_matches(pairs):
+def test_pictures_of_two_scenes_and_plain_ones_are_told_apart(pairs):
+    unrelated = check_pair(pairs[1][0], pairs[2][1])
+    assert unrelated.defects == ("unrelated",)
+    assert unrelated.lines() == unrelated.warnings()
+    assert str(unrelated.lines()[0]).startswith("expected two pictures of the same scene, found ")
     plain = np.full((100, 200, 3), 90, np.uint8)
-    for left, right in ((pairs[1][0], pairs[2][1]), (plain, plain)):
+    found = check_pair(plain, plain)
+    assert found.defects == ("too_few_matches",)
+    assert str(found.lines()[0]).startswith("expected pictures with more texture, found 0 matching points")
+    assert not (found.is_known or found.is_rectified)
+
+
+def test_one_picture_given_twice_is_named(pairs):
+    left, _ = pairs[0]
+    noisy = np.clip(left + np.random.default_rng(0).normal(0, 3, left.shape), 0, 255).astype(np.uint8)
+    for right in (left, noisy):
         found = check_pair(left, right)
-        assert found.defects == ("too_few_matches",)
-        assert found.lines() == found.warnings()
-        assert str(found.lines()[0]).startswith("expected two pictures of the same scene, found ")
+        assert found.defects == ("same_picture",)
+        assert str(found.warnings()[0]).startswith("left and right show the same view: ")
 
 
 def test_each_defect_has_a_note(pairs):

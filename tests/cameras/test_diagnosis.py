@@ -5,6 +5,7 @@ import pytest
 
 from stereoweave.cameras.diagnosis import find_problems
 from stereoweave.io.images import read_image, read_pair
+from stereoweave.learn.data.collage import paint_collage
 from stereoweave.matching.matcher import Matcher
 from stereoweave.stereo import Estimate, StereoPair
 
@@ -71,6 +72,13 @@ def test_pixels_without_content_need_no_confidence():
     assert find_problems(plain_pair(left_seen=seen), estimate_of(plain_pair(), confidence)) == []
     (line,) = find_problems(plain_pair(), estimate_of(plain_pair(), confidence))
     assert str(line).startswith("only 25 %")
+
+
+def test_pictures_of_two_scenes_are_named(example):
+    other = paint_collage(77, 0, 2, *example.left.shape[:2]).right
+    unrelated = StereoPair(left=example.left, right=other)
+    (line,) = find_problems(unrelated, estimate_of(unrelated, 0.1))
+    assert "different scenes" in str(line)
 
 
 @pytest.mark.testdata
