@@ -27,7 +27,7 @@ class OptionNames:
     """The `NameOf` for one command; it can be sent to other processes.
 
     Attributes:
-        options: The command's options, by parameter.
+        options: The command's options, by parameter; "no_" before a parameter stands for its negation.
     """
 
     options: dict[str, str]
@@ -40,7 +40,9 @@ class OptionNames:
 def option_names(command: TyperCommand) -> OptionNames:
     """Return the names of a command's options."""
     options = [parameter for parameter in command.params if parameter.param_type_name == "option"]
-    return OptionNames({str(option.name): option.opts[0] for option in options})
+    names = {str(option.name): option.opts[0] for option in options}
+    negations = {f"no_{option.name}": option.secondary_opts[0] for option in options if option.secondary_opts}
+    return OptionNames(names | negations)
 
 
 _running: ContextVar[NameOf] = ContextVar("names of the running command's options", default=keyword)

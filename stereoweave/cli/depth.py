@@ -78,7 +78,7 @@ def depth(  # noqa: PLR0913 - each is an option of the command line
     calib: Calib = None,
     focal_px: FocalPx = None,
     baseline_m: BaselineM = None,
-    rectify: Rectify = False,
+    rectify: Rectify = None,
     range_px: Range = None,
     write: Write = None,
     refined: Refined = False,

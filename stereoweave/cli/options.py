@@ -48,9 +48,11 @@ BaselineM = Annotated[
     typer.Option(help="Distance between the cameras in metres, in place of a calibration file."),
 ]
 Rectify = Annotated[
-    bool,
+    bool | None,
     typer.Option(
-        "--rectify", help="Rectify the pair by its calibration or, without one, by matched features."
+        "--rectify/--no-rectify",
+        help="Rectify the pair by its calibration or, without one, by matched features (default: by matched "
+        "features, if there is no calibration and corresponding points lie in different rows).",
     ),
 ]
 Range = Annotated[
@@ -137,7 +139,7 @@ def make_request(
     calib: Path | None = None,
     focal_px: float | None = None,
     baseline_m: float | None = None,
-    rectify: bool = False,
+    rectify: bool | None = None,
 ) -> "Request":
     """Return the `Request` that the options of a command line describe."""
     from stereoweave.pictures.prepare import Request

@@ -89,7 +89,7 @@ def view(  # noqa: PLR0913 - each is an option of the command line
     quilt: Quilt = None,
     format: Format = None,
     calib: Calib = None,
-    rectify: Rectify = False,
+    rectify: Rectify = None,
     range_px: Range = None,
     model: Model = "base",
     threads: Threads = None,
@@ -132,7 +132,7 @@ def view(  # noqa: PLR0913 - each is an option of the command line
     else:
         written = _write_layout(out, name, renderer, layout_options)
     typer.echo(f"{out}: {written}")
-    for note in (*prepared.notes, *find_problems(pair, estimate)):
+    for note in (*prepared.notes, *find_problems(pair, estimate, prepared.alignment)):
         typer.echo(note.format(running_options()))
 
 

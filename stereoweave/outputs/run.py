@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
+from stereoweave.cameras.alignment import Alignment
 from stereoweave.cameras.diagnosis import find_problems
 from stereoweave.errors import Note
 from stereoweave.matching.estimate import match_many
@@ -30,6 +31,7 @@ class Result:
         summary: Summary of the pair and its estimate.
         notes: Notes on what was detected or changed while the pictures were read.
         threads: Number of threads for rendering; default: all cores.
+        alignment: The alignment of the pair, if it has been measured.
     """
 
     pair: StereoPair
@@ -37,6 +39,7 @@ class Result:
     summary: Summary
     notes: tuple[Note, ...] = ()
     threads: int | None = None
+    alignment: Alignment | None = None
 
     @property
     def seen(self) -> Bool[np.ndarray, "h w"]:
@@ -54,8 +57,11 @@ class Result:
         return np.where(self.seen, depth_m, np.float32(unknown))
 
     def warnings(self) -> list[Note]:
-        """Return notes on likely defects of the pair; this takes about half as long as matching."""
-        return find_problems(self.pair, self.estimate)
+        """Return notes on likely defects of the pair.
+
+        This takes about half as long as matching, unless the alignment is known.
+        """
+        return find_problems(self.pair, self.estimate, self.alignment)
 
     @cached_property
     def point_cloud(self) -> PointCloud:
@@ -91,6 +97,7 @@ def run_many(prepared: Sequence[Prepared], matcher: Matcher, options: MatchOptio
             ),
             notes=each.notes,
             threads=matcher.threads,
+            alignment=each.alignment,
         )
         for each, estimate in zip(prepared, estimates, strict=True)
     ]

@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from stereoweave.cameras.alignment import Alignment
+from stereoweave.cameras.auto_align import align
 from stereoweave.cameras.calibration_files import read_rig
 from stereoweave.cameras.rectify import Rectified, rectify
 from stereoweave.cameras.rectify_uncalibrated import rectify_by_features
@@ -23,13 +25,14 @@ class Request:
         calibration: Calibration file of the two cameras (`calibration_files.read_rig`).
         focal_px, baseline_m: Focal length and baseline, instead of a calibration; default: from EXIF.
         rectify: Whether to rectify the pair, using the calibration or, if there is none, feature matches.
+            Default: `align` the pair, unless a calibration, focal length or baseline is given.
     """
 
     format: str | None = None
     calibration: Path | None = None
     focal_px: float | None = None
     baseline_m: float | None = None
-    rectify: bool = False
+    rectify: bool | None = None
 
     def __post_init__(self) -> None:
         if self.calibration and not (self.focal_px is None and self.baseline_m is None):
@@ -40,15 +43,19 @@ class Request:
 
 @dataclass(frozen=True, kw_only=True)
 class Prepared:
-    """A pair ready for matching, its picture files, and notes on what was detected or changed."""
+    """A pair ready for matching, its picture files, and notes on what was detected or changed.
+
+    `alignment` is the alignment of the pair, if it has been measured.
+    """
 
     pair: StereoPair
     pictures: tuple[Path, ...]
     notes: tuple[Note, ...] = ()
+    alignment: Alignment | None = None
 
 
 def prepare(pictures: Sequence[Path], request: Request) -> Prepared:
-    """Open a pair from two pictures (left first) or one picture with both views; rectify it if requested.
+    """Open a pair from two pictures (left first) or one picture with both views; rectify it if needed.
 
     The camera comes from the calibration, from the request, or from EXIF. The pair has no camera if the
     focal length or the baseline is unknown, or if the pair was rectified from feature matches.
@@ -59,13 +66,18 @@ def prepare(pictures: Sequence[Path], request: Request) -> Prepared:
     """
     opened = open_pictures(pictures, request.format)
     if request.calibration:
-        ready = _apply_calibration(opened.pair, request.calibration, request.rectify)
-    else:
-        camera, notes = _find_camera(opened.pair, opened.lens or Lens(), request)
-        ready = Rectified(pair=replace(opened.pair, camera=camera), notes=notes)
-        if request.rectify:
-            ready = _rectify_by_features(ready)
-    return Prepared(pair=ready.pair, pictures=tuple(pictures), notes=(*opened.notes, *ready.notes))
+        ready = _apply_calibration(opened.pair, request.calibration, bool(request.rectify))
+        return Prepared(pair=ready.pair, pictures=tuple(pictures), notes=(*opened.notes, *ready.notes))
+    camera, notes = _find_camera(opened.pair, opened.lens or Lens(), request)
+    pair = replace(opened.pair, camera=camera)
+    in_metres = request.focal_px is not None or request.baseline_m is not None
+    found = _align(pair, False if in_metres and request.rectify is None else request.rectify)
+    return Prepared(
+        pair=found.pair,
+        pictures=tuple(pictures),
+        notes=(*opened.notes, *notes, *found.notes),
+        alignment=found.alignment,
+    )
 
 
 def _apply_calibration(pair: StereoPair, path: Path, rectified: bool) -> Rectified:
@@ -107,13 +119,30 @@ def _find_camera(
     return None, ()
 
 
-def _rectify_by_features(ready: Rectified) -> Rectified:
-    """Rectify the pair from feature matches; drop its camera, as disparity at infinity is then unknown."""
-    rectified = rectify_by_features(ready.pair)
-    if ready.pair.camera is None:
-        return rectified
+@dataclass(frozen=True)
+class _Ready:
+    pair: StereoPair
+    notes: tuple[Note, ...] = ()
+    alignment: Alignment | None = None
+
+
+def _align(pair: StereoPair, rectified: bool | None) -> _Ready:
+    """Rectify the pair from feature matches, always, never, or by default where needed.
+
+    A rectified pair has no camera, as disparity at infinity is then unknown.
+    """
+    if rectified is False:
+        return _Ready(pair)
+    if rectified:
+        always = rectify_by_features(pair)
+        ready = _Ready(always.pair, always.notes)
+    else:
+        aligned = align(pair)
+        ready = _Ready(aligned.pair, aligned.notes, aligned.alignment)
+    if pair.camera is None or ready.pair.camera is not None:
+        return ready
     lost = Note(
         "no depth in metres after rectification from feature matches",
         Remedy("give a calibration", ("calibration",)),
     )
-    return replace(rectified, notes=(*rectified.notes, lost))
+    return replace(ready, notes=(*ready.notes, lost))

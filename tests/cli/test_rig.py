@@ -91,14 +91,16 @@ def test_a_pair_is_not_rectified_into_a_folder_to_which_another_command_writes(t
     assert not list(tmp_path.iterdir())
 
 
-def test_depth_and_view_warn_of_an_unrectified_pair_and_rectify_corrects_it(turned, tmp_path, capsys):
-    assert main(["depth", LEFT, turned, "-o", str(tmp_path / "as_it_is")]) == 0
+def test_depth_and_view_rectify_a_pair_out_of_line_unless_told_otherwise(turned, tmp_path, capsys):
+    assert main(["depth", LEFT, turned, "--no-rectify", "-o", str(tmp_path / "as_it_is")]) == 0
     assert "is rotated 1.0 degrees" in capsys.readouterr().out
-    assert main(["depth", LEFT, turned, "--rectify", "-o", str(tmp_path / "mended")]) == 0
-    assert "is rotated" not in capsys.readouterr().out
+    assert main(["depth", LEFT, turned, "-o", str(tmp_path / "mended")]) == 0
+    printed = capsys.readouterr().out
+    assert "is rotated" not in printed
+    assert "keep the pictures as they are (--no-rectify)" in printed
+    assert main(["view", LEFT, turned, "--no-rectify", "-o", str(tmp_path / "view.png")]) == 0
+    assert "is rotated 1.0 degrees" in capsys.readouterr().out
     assert main(["view", LEFT, turned, "-o", str(tmp_path / "view.png")]) == 0
-    assert "is rotated 1.0 degrees" in capsys.readouterr().out
-    assert main(["view", LEFT, turned, "--rectify", "-o", str(tmp_path / "view.png")]) == 0
     assert "is rotated" not in capsys.readouterr().out
     # The borders that rectification leaves are cut off.
     assert np.array_equal(np.less(read_image(tmp_path / "view.png").shape[:2], (480, 640)), [True, True])

@@ -252,5 +252,5 @@ def test_a_batch_s_job_facts_keep_their_names_so_that_earlier_batches_can_resume
         "calibration": None,
         "focal_px": None,
         "baseline_m": None,
-        "rectify": False,
+        "rectify": None,
     }
