@@ -7,6 +7,7 @@ from stereoweave.system.telemetry import disable_telemetry
 
 if TYPE_CHECKING:
     from stereoweave.errors import FormatError, MatcherError, StereoweaveError
+    from stereoweave.io.images import read_image
     from stereoweave.matching.estimate import estimate
     from stereoweave.matching.matcher import Matcher
     from stereoweave.matching.sgbm_interface import StereoMatcher
@@ -29,6 +30,7 @@ _HOMES = {
     "StereoweaveError": "errors",
     "View": "stereo",
     "estimate": "matching.estimate",
+    "read_image": "io.images",
     "render": "rendering.renderer",
     "synthesize": "rendering.synthesize",
 }
@@ -47,6 +49,7 @@ __all__ = [
     "View",
     "__version__",
     "estimate",
+    "read_image",
     "render",
     "synthesize",
 ]

@@ -108,6 +108,7 @@ def calls() -> list[Call]:
         Call("DepthCurve of depth", sw.DepthCurve, max_depth_m=10.0),
         Call("StereoMatcher", sw.StereoMatcher, minDisparity=0, numDisparities=64, min_confidence=0.5, **how),
         Call("StereoMatcher.compute", sw.StereoMatcher(threads=1).compute, **pair),
+        Call("read_image", sw.read_image, path=TEXTURED / "left.png"),
         Call("as_rgb", as_rgb, image=LEFT, name="picture"),
     ]
 
