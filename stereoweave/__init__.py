@@ -59,11 +59,14 @@ __all__ = [
 disable_telemetry()
 
 
-def __getattr__(name: str) -> Any:
-    """Import a public name on first access (PEP 562), so that importing the package is fast."""
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+# Type checkers would take every name as existing if they saw this function.
+if not TYPE_CHECKING:
+
+    def __getattr__(name: str) -> Any:
+        """Import a public name on first access (PEP 562), so that importing the package is fast."""
+        if name not in _HOMES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
 
 
 def __dir__() -> list[str]:
