@@ -63,6 +63,12 @@ class Renderer:
         self._hidden: dict[bool, HiddenBackground] = {}
         self._confidence = np.require(estimate.confidence, np.float32, ["C", "W"])
 
+    def __repr__(self) -> str:
+        height, width = self.pair.left.shape[:2]
+        return (
+            f"Renderer({width}x{height}, strength {self.strength:g}, convergence {self.convergence_px:g} px)"
+        )
+
     def view(self, position: float, *, up: float = 0.0, forward: float = 0.0) -> View:
         """Render the view from a position, where 0 is the left camera and 1 the right one; see `render`.
 
