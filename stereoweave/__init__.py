@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from stereoweave.io.images import read_image
     from stereoweave.matching.estimate import estimate
     from stereoweave.matching.matcher import Matcher
-    from stereoweave.matching.sgbm_interface import StereoMatcher
+    from stereoweave.matching.opencv_interface.stereo_matcher import StereoMatcher
     from stereoweave.rendering.renderer import render
     from stereoweave.rendering.synthesize import synthesize
     from stereoweave.stereo import DepthCurve, Estimate, Sample, StereoCamera, StereoPair, View
@@ -25,7 +25,7 @@ _HOMES = {
     "MatcherError": "errors",
     "Sample": "stereo",
     "StereoCamera": "stereo",
-    "StereoMatcher": "matching.sgbm_interface",
+    "StereoMatcher": "matching.opencv_interface.stereo_matcher",
     "StereoPair": "stereo",
     "StereoweaveError": "errors",
     "View": "stereo",
