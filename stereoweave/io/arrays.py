@@ -61,7 +61,7 @@ def as_rgb(image: ImageLike, name: str = "image") -> UInt8[np.ndarray, "h w 3"]:
     if not is_plain_array(image):
         raise StereoweaveError(
             f"{name}: expected a path, a NumPy array, a PIL image or a torch tensor, "
-            f"got {type(image).__name__}"
+            f"got {describe_kind(image)}"
         )
     levels = _move_channels_last(_to_eight_bits(image, name), name)
     match levels.shape[2]:
@@ -70,6 +70,13 @@ def as_rgb(image: ImageLike, name: str = "image") -> UInt8[np.ndarray, "h w 3"]:
         case 4:
             return np.ascontiguousarray(levels[..., :3])
     return np.ascontiguousarray(levels)
+
+
+def describe_kind(image: object) -> str:
+    """Name the type of what was passed as an image; for None, with the likely cause and the remedy."""
+    if image is None:
+        return "None, which cv2.imread returns for a file that it cannot read; check the path"
+    return type(image).__name__
 
 
 def _convert_pil(picture: Image.Image) -> Shaped[np.ndarray, "h w *channels"]:

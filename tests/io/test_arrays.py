@@ -153,7 +153,7 @@ def test_a_path_that_cannot_be_read_is_named_with_the_reason(tmp_path, monkeypat
     ("thing", "words"),
     [
         (b"left.png", ["got bytes", "expected a path"]),
-        (None, ["got NoneType"]),
+        (None, ["got None, which cv2.imread returns", "check the path"]),
         (np.zeros((2, 40, 50, 3), np.uint8), ["got [2, 40, 50, 3]", "one image at a time"]),
         (np.zeros((40, 50, 2), np.uint8), ["got [40, 50, 2]"]),
         (np.zeros(3), ["got [3]"]),

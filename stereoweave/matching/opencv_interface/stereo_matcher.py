@@ -9,7 +9,7 @@ from jaxtyping import Bool, Int16, UInt8
 
 from stereoweave.arguments import check_flag, check_number, describe, is_plain_array
 from stereoweave.errors import StereoweaveError
-from stereoweave.io.arrays import as_rgb
+from stereoweave.io.arrays import as_rgb, describe_kind
 from stereoweave.matching.backend import Backend
 from stereoweave.matching.estimate import match
 from stereoweave.matching.opencv_interface.settings import Rectangle, Settings
@@ -172,6 +172,6 @@ def _rgb_of_bgr(picture: UInt8[np.ndarray, "h w *channels"], name: str) -> UInt8
     if not isinstance(picture, np.ndarray) or picture.dtype != np.uint8:
         raise StereoweaveError(
             f"{name}: expected a uint8 array, BGR [H, W, 3] or grey [H, W], as returned by cv2.imread, "
-            f"got {getattr(picture, 'dtype', type(picture).__name__)}"
+            f"got {picture.dtype if isinstance(picture, np.ndarray) else describe_kind(picture)}"
         )
     return np.ascontiguousarray(as_rgb(picture, name)[..., ::-1])

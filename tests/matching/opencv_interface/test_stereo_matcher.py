@@ -201,7 +201,11 @@ def test_a_matcher_is_shown_by_its_range_and_model():
 @pytest.mark.usefixtures("without_shape_checks")
 @pytest.mark.parametrize(
     ("picture", "found"),
-    [(Image.new("RGB", (64, 64)), "got Image"), (np.zeros((64, 64), np.float32), "got float32")],
+    [
+        (Image.new("RGB", (64, 64)), "got Image"),
+        (np.zeros((64, 64), np.float32), "got float32"),
+        (None, "got None, which cv2.imread returns for a file that it cannot read; check the path"),
+    ],
 )
 def test_pictures_that_cv2_would_not_return_are_refused(picture, found):
     with pytest.raises(StereoweaveError, match=found):
