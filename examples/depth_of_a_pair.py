@@ -5,8 +5,6 @@ Run: python examples/depth_of_a_pair.py
 
 from pathlib import Path
 
-from PIL import Image
-
 import stereoweave as sw
 from stereoweave.cameras.calibration_files import read_rig
 from stereoweave.io.colormap import colour_disparity, find_colour_range_px
@@ -15,7 +13,7 @@ from stereoweave.io.maps import write_depth_png
 
 HERE = Path(__file__).parent
 
-estimate = sw.estimate(Image.open(HERE / "left.png"), Image.open(HERE / "right.png"))
+estimate = sw.estimate(HERE / "left.png", HERE / "right.png")
 camera = read_rig(HERE / "calib.txt").camera()
 depth_m = camera.depth_m(estimate.disparity_px)
 

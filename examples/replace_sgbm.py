@@ -8,14 +8,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from stereoweave.matching.sgbm_interface import StereoMatcher
+import stereoweave as sw
 
 HERE = Path(__file__).parent
 
 left, right = (cv2.imread(str(HERE / name)) for name in ("left.png", "right.png"))
 
 # Was: matcher = cv2.StereoSGBM.create(minDisparity=0, numDisparities=64, blockSize=5, P1=600, P2=2400)
-matcher = StereoMatcher(minDisparity=0, numDisparities=64)
+matcher = sw.StereoMatcher(minDisparity=0, numDisparities=64, blockSize=5, P1=600, P2=2400)
 
 disparity_px = matcher.compute(left, right).astype(np.float32) / 16.0
 known = disparity_px > matcher.getMinDisparity()

@@ -51,7 +51,7 @@ TARGETS = {
         (
             "matching/test_estimate.py",
             "rendering/test_synthesize.py",
-            "matching/test_sgbm_interface.py",
+            "matching/opencv_interface/test_stereo_matcher.py",
             "matching/test_disparity_range.py",
             "test_wrong_arguments.py",
         ),

@@ -7,9 +7,10 @@ from stereoweave.system.telemetry import disable_telemetry
 
 if TYPE_CHECKING:
     from stereoweave.errors import FormatError, MatcherError, StereoweaveError
+    from stereoweave.io.images import read_image
     from stereoweave.matching.estimate import estimate
     from stereoweave.matching.matcher import Matcher
-    from stereoweave.matching.sgbm_interface import StereoMatcher
+    from stereoweave.matching.opencv_interface.stereo_matcher import StereoMatcher
     from stereoweave.rendering.renderer import render
     from stereoweave.rendering.synthesize import synthesize
     from stereoweave.stereo import DepthCurve, Estimate, Sample, StereoCamera, StereoPair, View
@@ -24,11 +25,12 @@ _HOMES = {
     "MatcherError": "errors",
     "Sample": "stereo",
     "StereoCamera": "stereo",
-    "StereoMatcher": "matching.sgbm_interface",
+    "StereoMatcher": "matching.opencv_interface.stereo_matcher",
     "StereoPair": "stereo",
     "StereoweaveError": "errors",
     "View": "stereo",
     "estimate": "matching.estimate",
+    "read_image": "io.images",
     "render": "rendering.renderer",
     "synthesize": "rendering.synthesize",
 }
@@ -47,6 +49,7 @@ __all__ = [
     "View",
     "__version__",
     "estimate",
+    "read_image",
     "render",
     "synthesize",
 ]
@@ -56,11 +59,14 @@ __all__ = [
 disable_telemetry()
 
 
-def __getattr__(name: str) -> Any:
-    """Import a public name on first access (PEP 562), so that importing the package is fast."""
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+# Type checkers would take every name as existing if they saw this function.
+if not TYPE_CHECKING:
+
+    def __getattr__(name: str) -> Any:
+        """Import a public name on first access (PEP 562), so that importing the package is fast."""
+        if name not in _HOMES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
 
 
 def __dir__() -> list[str]:

@@ -122,6 +122,11 @@ class StereoPair:
                     f"{side}_seen: expected the shape of the images {self.left.shape[:2]}, got {seen.shape}"
                 )
 
+    def __repr__(self) -> str:
+        masks = (("left", self.left_seen), ("right", self.right_seen))
+        shares = [f"{_percent(seen)} of {side} with content" for side, seen in masks if seen is not None]
+        return _summary(self, self.left, *_list_camera(self.camera), *shares)
+
     def mirror(self) -> "StereoPair":
         """Return the pair flipped horizontally, with its views swapped and without its camera."""
         return StereoPair(
@@ -170,6 +175,15 @@ class Estimate:
                 f"{self.confidence.max():g}"
             )
 
+    def __repr__(self) -> str:
+        return _summary(
+            self,
+            self.disparity_px,
+            f"disparity {_range(self.disparity_px)}",
+            f"mean confidence {_mean(self.confidence):.2f}",
+            f"{_percent(self.occluded)} occluded",
+        )
+
 
 def check_fits(estimate: Estimate, pair: StereoPair) -> None:
     """Require an estimate of the same size as the pair."""
@@ -189,6 +203,9 @@ class View:
 
     image: UInt8[np.ndarray, "h w 3"]
     drawn: Bool[np.ndarray, "h w"]
+
+    def __repr__(self) -> str:
+        return _summary(self, self.image, f"{_percent(self.drawn)} drawn")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -210,6 +227,17 @@ class Sample:
     occluded: Bool[np.ndarray, "h w"]
     right_occluded: Bool[np.ndarray, "h w"]
     camera: StereoCamera | None = None
+
+    def __repr__(self) -> str:
+        known = ~np.isnan(self.disparity_px)
+        return _summary(
+            self,
+            self.left,
+            f"disparity {_range(self.disparity_px[known])}",
+            f"{_percent(known)} known",
+            f"{_percent(self.occluded)} occluded",
+            *_list_camera(self.camera),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -322,3 +350,27 @@ def _refuse(outside: ArrayOrTensor, expected: str) -> None:
 
 def _size(image: np.ndarray) -> str:
     return f"{image.shape[1]}x{image.shape[0]}"
+
+
+def _summary(value: object, image: np.ndarray, *parts: str) -> str:
+    """Return the text that stands for a value in an interactive session, instead of its arrays."""
+    return f"{type(value).__name__}({', '.join([_size(image), *parts])})"
+
+
+def _list_camera(camera: StereoCamera | None) -> list[str]:
+    return [f"focal length {camera.focal_px:g} px, baseline {camera.baseline_m:g} m"] if camera else []
+
+
+def _range(disparity_px: Float[np.ndarray, "..."]) -> str:
+    if not disparity_px.size:
+        return "unknown"
+    return f"{disparity_px.min():.1f} to {disparity_px.max():.1f} px"
+
+
+def _percent(mask: Bool[np.ndarray, "h w"]) -> str:
+    return f"{100 * _mean(mask):.1f} %"
+
+
+def _mean(values: np.ndarray) -> float:
+    """Return the mean; NaN, without NumPy's warning, if there is no value."""
+    return float(values.mean()) if values.size else math.nan

@@ -182,7 +182,7 @@ def test_a_user_s_own_scenes_are_scored_from_the_wheel(installed, pictures, cach
 def test_the_programs_run_from_the_wheel_in_a_user_s_environment(installed, pictures, caches):
     for program in PROGRAMS:
         run([installed / "bin" / "python", "-c", program], pictures, NUMBA_CACHE_DIR=caches)
-    assert len(PROGRAMS) == 2
+    assert len(PROGRAMS) == 3
     assert read_image(pictures / "view.png").shape == (64, 96, 3)
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stereoweave.errors import StereoweaveError
-from stereoweave.stereo import Estimate, StereoCamera, StereoPair
+from stereoweave.stereo import Estimate, Sample, StereoCamera, StereoPair, View
 
 CAMERA = {"focal_px": 1000.0, "baseline_m": 0.1, "cx_px": 320.0, "cy_px": 240.0}
 
@@ -104,3 +104,50 @@ def test_an_estimate_refuses_disparities_that_are_not_finite():
 def test_an_estimate_refuses_maps_of_two_sizes():
     with pytest.raises(StereoweaveError, match="occluded: expected the shape of disparity_px"):
         make_estimate(occluded=np.zeros((4, 6), bool))
+
+
+def test_a_pair_is_shown_by_its_size_camera_and_share_of_content():
+    image = np.zeros((480, 640, 3), np.uint8)
+    seen = np.ones((480, 640), bool)
+    seen[:, :64] = False
+    assert repr(StereoPair(left=image, right=image)) == "StereoPair(640x480)"
+    assert repr(StereoPair(left=image, right=image, camera=StereoCamera(**CAMERA), right_seen=seen)) == (
+        "StereoPair(640x480, focal length 1000 px, baseline 0.1 m, 90.0 % of right with content)"
+    )
+
+
+def test_an_estimate_is_shown_by_its_size_range_confidence_and_occlusion():
+    disparity_px = np.full((4, 5), 3.14, np.float32)
+    disparity_px[2, 3] = -60.96
+    occluded = np.zeros((4, 5), bool)
+    occluded[0, :3] = True
+    found = make_estimate(
+        disparity_px=disparity_px, confidence=np.full((4, 5), 0.756, np.float32), occluded=occluded
+    )
+    assert repr(found) == "Estimate(5x4, disparity -61.0 to 3.1 px, mean confidence 0.76, 15.0 % occluded)"
+
+
+def test_an_estimate_of_no_pixels_is_shown():
+    nothing = np.zeros((0, 5), np.float32)
+    found = Estimate(
+        disparity_px=nothing, right_disparity_px=nothing, confidence=nothing, occluded=nothing > 0
+    )
+    assert repr(found) == "Estimate(5x0, disparity unknown, mean confidence nan, nan % occluded)"
+
+
+def test_a_view_is_shown_by_its_size_and_the_share_that_is_drawn():
+    drawn = np.ones((8, 10), bool)
+    drawn[0] = False
+    assert repr(View(image=np.zeros((8, 10, 3), np.uint8), drawn=drawn)) == "View(10x8, 87.5 % drawn)"
+
+
+def test_a_sample_is_shown_by_the_range_of_what_is_known():
+    image, mask = np.zeros((2, 4, 3), np.uint8), np.zeros((2, 4), bool)
+    disparity_px = np.array([[1, 2, 3, np.nan], [4, 5, np.nan, 7]], np.float32)
+
+    def shown(truth_px):
+        views = {"left": image, "right": image, "disparity_px": truth_px, "right_disparity_px": truth_px}
+        return repr(Sample(**views, occluded=mask, right_occluded=mask, camera=None))
+
+    assert shown(disparity_px) == "Sample(4x2, disparity 1.0 to 7.0 px, 75.0 % known, 0.0 % occluded)"
+    assert shown(disparity_px * np.nan) == "Sample(4x2, disparity unknown, 0.0 % known, 0.0 % occluded)"

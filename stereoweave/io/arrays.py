@@ -1,4 +1,7 @@
-"""Conversion of NumPy arrays, PIL images and PyTorch tensors to uint8 RGB."""
+"""Conversion of images in the forms that callers have them to uint8 RGB."""
+
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Shaped, UInt8
@@ -6,6 +9,7 @@ from PIL import Image
 
 from stereoweave.arguments import is_plain_array
 from stereoweave.errors import StereoweaveError
+from stereoweave.io.images import read_image
 
 _CHANNELS = (1, 3, 4)
 # Tolerance beyond 0..1: less than half a level, so that such a value still rounds to 0 or 255.
@@ -14,26 +18,41 @@ _FORGIVEN = 0.4 / 255
 _BETWEEN = {"La": "LA", "RGBa": "RGBA"}
 
 
-def as_rgb(image: object, name: str = "image") -> UInt8[np.ndarray, "h w 3"]:
+@runtime_checkable
+class Tensor(Protocol):
+    """PyTorch tensor, recognised by its methods, so that PyTorch is not imported."""
+
+    def detach(self) -> Any: ...
+
+
+# Everything that `as_rgb` accepts.
+ImageLike = str | Path | Image.Image | np.ndarray | Tensor
+
+
+def as_rgb(image: ImageLike, name: str = "image") -> UInt8[np.ndarray, "h w 3"]:
     """Convert an image to contiguous uint8 RGB [H, W, 3]; an array already in this form is not copied.
 
     Grey is repeated in all three channels, alpha is dropped, 16-bit values are reduced to their upper 8 bits,
     and floats in 0..1 are scaled and rounded. The channels are the last axis if its length is 1, 3 or 4, else
     the first axis, so [3, W, 3] means 3 rows of W pixels. A batch of one image loses its leading axis.
+    A path is read by `read_image`.
 
     Channels are taken to be RGB: reverse OpenCV's BGR images with `image[..., ::-1]` first. The EXIF
     orientation of a PIL image is ignored: apply `PIL.ImageOps.exif_transpose` first.
 
     Args:
-        image: NumPy array, PIL image of any colour mode, or PyTorch tensor on any device.
+        image: NumPy array, PIL image of any colour mode, PyTorch tensor on any device, or path of a picture.
         name: Name of the image in error messages.
 
     Raises:
-        StereoweaveError: The type, shape or dtype is unsupported, or a float is outside 0..1.
+        StereoweaveError: The type, shape or dtype is unsupported, or a float is outside 0..1; FormatError for
+            a picture that cannot be read.
     """
+    if isinstance(image, str | Path):
+        return read_image(image)
     if isinstance(image, Image.Image):
         image = _convert_pil(image)
-    elif hasattr(image, "detach"):  # a tensor, detected without importing PyTorch
+    elif isinstance(image, Tensor):
         tensor = image.detach().cpu()
         # NumPy has no bfloat16.
         image = (tensor.float() if tensor.is_floating_point() else tensor).numpy()
@@ -41,8 +60,8 @@ def as_rgb(image: object, name: str = "image") -> UInt8[np.ndarray, "h w 3"]:
         image = np.asarray(image)
     if not is_plain_array(image):
         raise StereoweaveError(
-            f"{name}: expected a NumPy array, a PIL image or a torch tensor, got {type(image).__name__}; "
-            "open a file with PIL.Image.open"
+            f"{name}: expected a path, a NumPy array, a PIL image or a torch tensor, "
+            f"got {describe_kind(image)}"
         )
     levels = _move_channels_last(_to_eight_bits(image, name), name)
     match levels.shape[2]:
@@ -51,6 +70,13 @@ def as_rgb(image: object, name: str = "image") -> UInt8[np.ndarray, "h w 3"]:
         case 4:
             return np.ascontiguousarray(levels[..., :3])
     return np.ascontiguousarray(levels)
+
+
+def describe_kind(image: object) -> str:
+    """Name the type of what was passed as an image; for None, with the likely cause and the remedy."""
+    if image is None:
+        return "None, which cv2.imread returns for a file that it cannot read; check the path"
+    return type(image).__name__
 
 
 def _convert_pil(picture: Image.Image) -> Shaped[np.ndarray, "h w *channels"]:

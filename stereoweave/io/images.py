@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import UInt8, UInt16
 from PIL import Image
 
+from stereoweave.arguments import check_kind
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io.decoding import read_picture
 from stereoweave.io.exif import read_orientation
@@ -36,6 +37,7 @@ def read_image(path: str | Path) -> UInt8[np.ndarray, "h w 3"]:
         FormatError: The file is missing, truncated, animated or of an unsupported format, or the picture has
             a side of less than 32 or more than 32,766 pixels, or more than 65 megapixels.
     """
+    check_kind("path", path, str, Path)
     decoded = read_picture(Path(path))
     image = decoded.upright(read_orientation(decoded.tags))
     check_large_enough(path, image)

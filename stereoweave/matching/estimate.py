@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
 from stereoweave.errors import StereoweaveError
-from stereoweave.io.arrays import as_rgb
+from stereoweave.io.arrays import ImageLike, as_rgb
 from stereoweave.io.images import SMALLEST_SIDE_PX
 from stereoweave.matching.backend import Backend
 from stereoweave.matching.disparity_range import find_range, goes_beyond
@@ -62,8 +62,8 @@ class _NetworkInput(NamedTuple):
 
 
 def estimate(  # noqa: PLR0913 - all but the images are keyword-only and optional
-    left: object,
-    right: object,
+    left: ImageLike,
+    right: ImageLike,
     *,
     model: str | Path = "small",
     threads: int | None = None,
@@ -75,8 +75,8 @@ def estimate(  # noqa: PLR0913 - all but the images are keyword-only and optiona
     """Estimate both views' disparities, the confidence and the occlusion mask of a rectified pair.
 
     Args:
-        left: Left image of at least 32x32 px, as uint8 RGB [H, W, 3] or any other type that `arrays.as_rgb`
-            accepts, such as a PIL image or a PyTorch tensor.
+        left: Left image of at least 32x32 px: path, PIL image, RGB array [H, W, 3] or [3, H, W], or PyTorch
+            tensor, of uint8, uint16 or floats in 0..1; see `arrays.as_rgb`.
         right: Right image of the same size.
         model: Name of a shipped network, `best`, or the path of an .onnx matcher file. `best` runs the
             network `base`, runs it again at up to 1.5 times the size, and refines the result. The network is

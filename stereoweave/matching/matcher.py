@@ -111,6 +111,9 @@ class Matcher:
         is_fixed = isinstance(height, int) and isinstance(width, int)
         self.fixed_size: tuple[int, int] | None = (height, width) if is_fixed else None
 
+    def __repr__(self) -> str:
+        return f"Matcher({self.model}, disparity 0 to {self.max_disparity_px:g} px, {self.provider})"
+
     def estimate(
         self,
         left: UInt8[np.ndarray, "h w 3"],

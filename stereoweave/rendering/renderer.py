@@ -12,6 +12,7 @@ from jaxtyping import Float, UInt8
 
 from stereoweave.arguments import check_number
 from stereoweave.errors import StereoweaveError
+from stereoweave.io.arrays import ImageLike, as_rgb
 from stereoweave.matching.exposure import match_exposure, recolour
 from stereoweave.stereo import Estimate, StereoCamera, StereoPair, View, check_fits
 from stereoweave.system.threads import in_bands, thread_count
@@ -61,6 +62,12 @@ class Renderer:
         self._looks = looks.result()
         self._hidden: dict[bool, HiddenBackground] = {}
         self._confidence = np.require(estimate.confidence, np.float32, ["C", "W"])
+
+    def __repr__(self) -> str:
+        height, width = self.pair.left.shape[:2]
+        return (
+            f"Renderer({width}x{height}, strength {self.strength:g}, convergence {self.convergence_px:g} px)"
+        )
 
     def view(self, position: float, *, up: float = 0.0, forward: float = 0.0) -> View:
         """Render the view from a position, where 0 is the left camera and 1 the right one; see `render`.
@@ -132,8 +139,8 @@ class HiddenBackground(NamedTuple):
 
 
 def render(  # noqa: PLR0913 - the options of one view
-    left: UInt8[np.ndarray, "h w 3"],
-    right: UInt8[np.ndarray, "h w 3"],
+    left: ImageLike,
+    right: ImageLike,
     estimate: Estimate,
     position: float,
     threads: int | None = None,
@@ -157,7 +164,7 @@ def render(  # noqa: PLR0913 - the options of one view
     To render many views of one pair, use `Renderer`.
 
     Args:
-        left: Left image, uint8 RGB [H, W, 3].
+        left: Left image, as for `estimate`: path, PIL image, array or tensor.
         right: Right image of the same size.
         estimate: The pair's estimate (`stereoweave.estimate`).
         position: Position from -1 to 2; 0 is the left camera and 1 the right one.
@@ -176,7 +183,7 @@ def render(  # noqa: PLR0913 - the options of one view
     Raises:
         ValueError: The sizes differ, or a number is out of range.
     """
-    pair = StereoPair(left=left, right=right, camera=camera)
+    pair = StereoPair(left=as_rgb(left, "left"), right=as_rgb(right, "right"), camera=camera)
     renderer = Renderer(pair, estimate, strength=strength, convergence_px=convergence_px, threads=threads)
     return renderer.view(position, up=up, forward=forward)
 

@@ -2,9 +2,7 @@
 
 from pathlib import Path
 
-import numpy as np
-from jaxtyping import UInt8
-
+from stereoweave.io.arrays import ImageLike, as_rgb
 from stereoweave.matching.estimate import estimate
 from stereoweave.matching.providers import CPU
 from stereoweave.rendering.renderer import check_position, render
@@ -12,8 +10,8 @@ from stereoweave.stereo import View
 
 
 def synthesize(  # noqa: PLR0913 - all but the first three are optional
-    left: UInt8[np.ndarray, "h w 3"],
-    right: UInt8[np.ndarray, "h w 3"],
+    left: ImageLike,
+    right: ImageLike,
     position: float,
     model: str | Path = "base",
     threads: int | None = None,
@@ -23,7 +21,7 @@ def synthesize(  # noqa: PLR0913 - all but the first three are optional
     """Estimate the refined disparity of a rectified pair and render the view from a position.
 
     Args:
-        left: Left image, uint8 RGB [H, W, 3].
+        left: Left image, as for `estimate`: path, PIL image, array or tensor.
         right: Right image of the same size.
         position: Position from -1 to 2; 0 is the left camera and 1 the right one.
         model: See `estimate`. The default is the accurate model, because a new view shows every error at an
@@ -38,5 +36,6 @@ def synthesize(  # noqa: PLR0913 - all but the first three are optional
         ValueError: See `estimate` and `render`. The position is checked before matching.
     """
     check_position(position)
+    left, right = as_rgb(left, "left"), as_rgb(right, "right")
     found = estimate(left, right, model=model, threads=threads, provider=provider, refined=True)
     return render(left, right, found, position, threads)

@@ -1,12 +1,13 @@
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
-from stereoweave.errors import StereoweaveError
+from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io.arrays import as_rgb
 from stereoweave.io.images import read_image
 
@@ -129,12 +130,30 @@ def test_converting_images_does_not_import_pytorch():
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
 
 
+@pytest.mark.parametrize("as_kind", [str, Path])
+def test_a_path_is_read_and_turned_upright(tmp_path, as_kind):
+    picture = Image.fromarray(COLOURS)
+    picture.getexif()[0x0112] = 6  # rotate clockwise by 90 degrees for display
+    picture.save(tmp_path / "left.png", exif=picture.getexif())
+    image = as_rgb(as_kind(tmp_path / "left.png"))
+    np.testing.assert_array_equal(image, np.rot90(COLOURS, -1))
+
+
+@pytest.mark.parametrize("name", ["missing.png", ""])
+def test_a_path_that_cannot_be_read_is_named_with_the_reason(tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(
+        FormatError, match=r"^(missing.png|\.): expected a picture .*(no such file|a folder)$"
+    ):
+        as_rgb(name, "left")
+
+
 @pytest.mark.usefixtures("without_shape_checks")
 @pytest.mark.parametrize(
     ("thing", "words"),
     [
-        ("left.png", ["got str", "PIL.Image.open"]),
-        (None, ["got NoneType"]),
+        (b"left.png", ["got bytes", "expected a path"]),
+        (None, ["got None, which cv2.imread returns", "check the path"]),
         (np.zeros((2, 40, 50, 3), np.uint8), ["got [2, 40, 50, 3]", "one image at a time"]),
         (np.zeros((40, 50, 2), np.uint8), ["got [40, 50, 2]"]),
         (np.zeros(3), ["got [3]"]),

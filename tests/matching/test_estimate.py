@@ -3,8 +3,8 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from image_forms import IMAGE_FORMS
 from matcher_examples import of_fixed_size
-from PIL import Image
 
 import stereoweave as sw
 from stereoweave.errors import StereoweaveError
@@ -60,9 +60,17 @@ def test_raw_is_the_networks_own_disparity_alone_and_in_a_batch(matcher, texture
     assert np.abs(filled.disparity_px - alone.disparity_px)[~alone.occluded].max() < 1.001
 
 
-def test_pil_images_are_matched_like_arrays(textured):
-    pictures = (Image.fromarray(photo) for photo in (textured.left, textured.right))
-    same(sw.estimate(*pictures), sw.estimate(textured.left, textured.right))
+@pytest.mark.parametrize("form", IMAGE_FORMS)
+def test_images_in_every_form_are_matched_like_arrays(textured, tmp_path, form):
+    part = sw.StereoPair(
+        left=np.ascontiguousarray(textured.left[200:264, 200:296]),
+        right=np.ascontiguousarray(textured.right[200:264, 200:296]),
+    )
+    left, right = (
+        IMAGE_FORMS[form](image, tmp_path / f"{side}.png")
+        for side, image in (("left", part.left), ("right", part.right))
+    )
+    same(sw.estimate(left, right), sw.estimate(part.left, part.right))
 
 
 @pytest.mark.parametrize("by_px", [60, 100])

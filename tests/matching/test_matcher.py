@@ -355,3 +355,7 @@ def test_padding_to_a_fixed_size_changes_little(tmp_path):
     sure = (alone.confidence > 0.9) & ~alone.occluded
     assert sure.mean() > 0.4
     assert np.mean(np.abs(found.disparity_px - alone.disparity_px)[sure] > 1) < 0.01
+
+
+def test_a_matcher_is_shown_by_its_model_range_and_provider():
+    assert repr(Matcher("small")) == "Matcher(small, disparity 0 to 192 px, cpu)"

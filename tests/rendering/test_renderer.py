@@ -381,3 +381,9 @@ def test_a_view_from_above_also_moves_surfaces_of_negative_disparity():
     level, above = (renderer.view(0.0, up=up).image[:, 15, 0] for up in (1e-9, 1.0))
     np.testing.assert_array_equal(np.flatnonzero(level > 100), np.arange(8, 12))
     np.testing.assert_array_equal(np.flatnonzero(above > 100), np.arange(13, 17))
+
+
+def test_a_renderer_is_shown_by_its_size_and_settings():
+    left, right, estimate = wall_with_object(slice(20, 30))
+    renderer = Renderer(StereoPair(left=left, right=right), estimate, strength=1.5, convergence_px=2)
+    assert repr(renderer) == "Renderer(40x5, strength 1.5, convergence 2 px)"

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from image_forms import IMAGE_FORMS
 
 import stereoweave as sw
 from stereoweave.bench.metrics import psnr_db
@@ -21,6 +22,19 @@ def test_synthesizing_is_estimating_and_then_rendering(pair):
     expected = render(*pair, estimate(*pair, model="base", refined=True), 0.3)
     np.testing.assert_array_equal(view.image, expected.image)
     np.testing.assert_array_equal(view.drawn, expected.drawn)
+
+
+@pytest.mark.parametrize("form", IMAGE_FORMS)
+def test_images_in_every_form_are_rendered_like_arrays(pair, tmp_path, form):
+    pictures = [IMAGE_FORMS[form](image, tmp_path / f"{side}.png") for side, image in enumerate(pair)]
+    estimate = sw.estimate(*pair)
+    expected = sw.render(*pair, estimate, 0.3)
+    np.testing.assert_array_equal(sw.render(*pictures, estimate, 0.3).image, expected.image)
+
+
+def test_a_view_is_synthesised_from_two_files(pair, tmp_path):
+    files = [IMAGE_FORMS["Path"](image, tmp_path / f"{side}.png") for side, image in enumerate(pair)]
+    np.testing.assert_array_equal(synthesize(*files, 0.3).image, synthesize(*pair, 0.3).image)
 
 
 def test_the_caller_chooses_the_model(pair):

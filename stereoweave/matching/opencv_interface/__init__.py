@@ -1,0 +1,1 @@
+"""Replacement for OpenCV's stereo matchers."""
