@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float, UInt8
 from stereoweave.arguments import check_kind
 from stereoweave.errors import MatcherError, StereoweaveError
 from stereoweave.io.images import SMALLEST_SIDE_PX
+from stereoweave.matching.edge_vote.vote import vote_at_edges
 from stereoweave.matching.left_right_check import OCCLUSION_STEP_PX, is_occluded, measure_disagreement
 from stereoweave.matching.occlusion_fill import fill_occluded
 from stereoweave.matching.options import MatchOptions
@@ -170,7 +171,7 @@ class Matcher:
         """Post-process the network's estimate: refine it to subpixel accuracy and fill occluded pixels.
 
         If `refined` or the matcher's preset requests it, `refine.refine` matches the pair once more between
-        these two steps.
+        these two steps. The preset then corrects edges and speckles (`vote_at_edges`).
         """
         found = to_subpixel(pair.left, pair.right, found, self.threads)
         if refined or self._refines:
@@ -178,7 +179,8 @@ class Matcher:
 
             found = refine(pair.left, pair.right, found, self.threads)
             found = to_subpixel(pair.left, pair.right, found, self.threads)
-        return fill_occluded(found, pair.left_seen)
+        found = fill_occluded(found, pair.left_seen)
+        return vote_at_edges(pair.left, found, self.threads) if self._refines else found
 
     def _check_sizes(self, pairs: Sequence[StereoPair]) -> None:
         sizes = sorted({pair.left.shape[:2] for pair in pairs})

@@ -1,0 +1,1 @@
+"""Vote of the neighbourhood on disparities at depth edges."""

@@ -1,0 +1,108 @@
+"""The vote at depth edges: against its plain reference, on edges worked out by hand, and on a network."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from plain_voting import plain_vote
+
+from stereoweave.bench.edge_metrics import flying_percent
+from stereoweave.io.images import read_pair
+from stereoweave.learn.data.collage import paint_collage
+from stereoweave.matching.edge_vote.vote import vote_at_edges
+from stereoweave.matching.edge_vote.vote_kernels import vote
+from stereoweave.matching.matcher import Matcher
+from stereoweave.stereo import Estimate
+
+TEXTURED = Path(__file__).resolve().parents[2] / "textured_pair"
+
+
+def estimate_of(disparity_px, confidence=0.9):
+    disparity_px = np.asarray(disparity_px, np.float32)
+    return Estimate(
+        disparity_px=disparity_px,
+        right_disparity_px=disparity_px.copy(),
+        confidence=np.full(disparity_px.shape, confidence, np.float32),
+        occluded=np.zeros(disparity_px.shape, bool),
+    )
+
+
+@pytest.fixture
+def red_before_blue():
+    """Return an image whose left half is red and whose right half is blue."""
+    image = np.zeros((40, 60, 3), np.uint8)
+    image[:, :30], image[:, 30:] = (200, 30, 30), (30, 30, 200)
+    return image
+
+
+def test_the_kernel_agrees_with_its_plain_reference(rng):
+    lab = (100 * rng.random((20, 30, 3))).astype(np.float32).round(-1)
+    disparity_px, confidence = ((scale * rng.random((20, 30))).astype(np.float32) for scale in (50, 1))
+    sound = rng.random((20, 30)) > 0.5
+    sound[:12, :12] = False
+    voted_px, unsound = disparity_px.copy(), ~sound
+    vote(lab, disparity_px, confidence, sound, voted_px, unsound, 0, 20)
+    expected_px, still_unsound = plain_vote(lab.astype(float), disparity_px, confidence, sound)
+    np.testing.assert_array_equal(voted_px, expected_px)
+    np.testing.assert_array_equal(unsound, still_unsound)
+    assert unsound.any()
+
+
+def test_a_disparity_between_two_surfaces_takes_that_of_its_colour(red_before_blue):
+    disparity_px = np.full((40, 60), 20.0)
+    disparity_px[:, 30:] = 5
+    disparity_px[:, 28:32] = [17, 14, 11, 8]
+    expected_px = np.where(np.arange(60) < 30, 20.0, 5.0)
+    found = vote_at_edges(red_before_blue, estimate_of(disparity_px))
+    np.testing.assert_array_equal(found.disparity_px, np.broadcast_to(expected_px, (40, 60)))
+
+
+def test_a_speckle_disappears_and_a_large_object_stays(red_before_blue):
+    disparity_px = np.full((40, 60), 20.0)
+    disparity_px[5:9, 5:9] = 50
+    disparity_px[15:35, 5:25] = 30
+    found_px = vote_at_edges(red_before_blue, estimate_of(disparity_px)).disparity_px
+    np.testing.assert_array_equal(found_px[5:9, 5:9], 20)
+    np.testing.assert_array_equal(found_px[18:32, 8:22], 30)
+
+
+def test_an_unsure_area_takes_the_disparity_around_it_and_stays_unsure(red_before_blue):
+    estimate = estimate_of(np.full((40, 60), 20.0))
+    estimate.disparity_px[10:20, 5:20] = 21.5
+    estimate.confidence[10:20, 5:20] = 0.1
+    found = vote_at_edges(red_before_blue, estimate)
+    np.testing.assert_array_equal(found.disparity_px, 20)
+    np.testing.assert_array_equal(found.confidence, estimate.confidence)
+
+
+def test_sound_disparities_do_not_change(red_before_blue, rng):
+    slanted_px = np.add.outer(np.zeros(40), np.linspace(10, 20, 60)) + 0.2 * rng.random((40, 60))
+    estimate = estimate_of(slanted_px)
+    np.testing.assert_array_equal(
+        vote_at_edges(red_before_blue, estimate).disparity_px, estimate.disparity_px
+    )
+
+
+def test_the_result_does_not_depend_on_the_number_of_threads():
+    pair = read_pair(TEXTURED / "left.png", TEXTURED / "right.png")
+    estimate = Matcher("small", threads=1).estimate(pair.left, pair.right)
+    one, three = (vote_at_edges(pair.left, estimate, threads) for threads in (1, 3))
+    np.testing.assert_array_equal(one.disparity_px, three.disparity_px)
+
+
+def test_fewer_pixels_fly_at_the_edges_of_a_painted_pair():
+    sample = paint_collage(77, 0, 2, 240, 320)
+    network = Matcher("small", threads=1).estimate(sample.left, sample.right)
+    before, after = (
+        flying_percent(estimate.disparity_px, sample.disparity_px)
+        for estimate in (network, vote_at_edges(sample.left, network))
+    )
+    assert after < 0.85 * before
+
+
+def test_an_image_of_one_colour_is_no_obstacle():
+    grey = np.full((32, 32, 3), 90, np.uint8)
+    noise_px = cv2.GaussianBlur(np.random.default_rng(0).random((32, 32)).astype(np.float32) * 40, (0, 0), 1)
+    found = vote_at_edges(grey, estimate_of(noise_px))
+    assert np.isfinite(found.disparity_px).all()
