@@ -83,7 +83,7 @@ def depth(  # noqa: PLR0913 - each is an option of the command line
     write: Write = None,
     refined: Refined = False,
     raw: Raw = False,
-    model: Model = "small",
+    model: Model = "best",
     threads: Threads = None,
     provider: Provider = "cpu",
     as_json: AsJson = False,
