@@ -3,13 +3,14 @@
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 from stereoweave.cameras.diagnosis import find_problems
-from stereoweave.errors import Note
+from stereoweave.errors import NameOf, Note, keyword
 from stereoweave.matching.estimate import match_many
 from stereoweave.matching.matcher import Matcher
 from stereoweave.matching.options import MatchOptions
@@ -30,6 +31,9 @@ class Result:
         summary: Summary of the pair and its estimate.
         notes: Notes on what was detected or changed while the pictures were read.
         threads: Number of threads for rendering; default: all cores.
+        date: When the pair was matched.
+        command: The command that asked for the result, as typed; "" if there was none.
+        name_of: The front end's names for settings, for the notes in the report.
     """
 
     pair: StereoPair
@@ -37,6 +41,9 @@ class Result:
     summary: Summary
     notes: tuple[Note, ...] = ()
     threads: int | None = None
+    date: datetime | None = None
+    command: str = ""
+    name_of: NameOf = keyword
 
     @property
     def seen(self) -> Bool[np.ndarray, "h w"]:
@@ -54,8 +61,12 @@ class Result:
         return np.where(self.seen, depth_m, np.float32(unknown))
 
     def warnings(self) -> list[Note]:
-        """Return notes on likely defects of the pair; this takes about half as long as matching."""
-        return find_problems(self.pair, self.estimate)
+        """Return notes on likely defects of the pair; the first call takes about half as long as matching."""
+        return list(self._problems)
+
+    @cached_property
+    def _problems(self) -> tuple[Note, ...]:
+        return tuple(find_problems(self.pair, self.estimate))
 
     @cached_property
     def point_cloud(self) -> PointCloud:
@@ -77,6 +88,7 @@ def run_many(prepared: Sequence[Prepared], matcher: Matcher, options: MatchOptio
     start_s = time.perf_counter()
     estimates = match_many(matcher, [each.pair for each in prepared], options)
     total_ms = 1000 * (time.perf_counter() - start_s)
+    date = datetime.now(UTC)
     model = matcher.model if matcher.provider == CPU else f"{matcher.model} on {matcher.provider}"
     return [
         Result(
@@ -91,6 +103,7 @@ def run_many(prepared: Sequence[Prepared], matcher: Matcher, options: MatchOptio
             ),
             notes=each.notes,
             threads=matcher.threads,
+            date=date,
         )
         for each, estimate in zip(prepared, estimates, strict=True)
     ]

@@ -1,0 +1,292 @@
+"""The report as its readers use it: in Chromium, by mouse, keyboard and finger."""
+
+import io
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from browsers import chromium
+from PIL import Image
+from playwright.sync_api import Browser, Page
+
+from stereoweave.outputs.report import Context, summarize, write_report
+from stereoweave.stereo import Estimate, StereoCamera, StereoPair
+
+pytestmark = pytest.mark.needs_chromium
+
+CAMERA = StereoCamera(focal_px=400, baseline_m=0.04, cx_px=160, cy_px=60, doffs_px=0)
+SHIFT_PX = 32
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with chromium() as browser:
+        yield browser
+
+
+@pytest.fixture
+def photograph(rng) -> np.ndarray:
+    """Return soft coloured blobs, which neither JPEG nor scaling changes much."""
+    coarse = rng.integers(0, 256, (17, 24, 3), dtype=np.uint8)
+    blobs = Image.fromarray(coarse).resize((320 + SHIFT_PX, 240), Image.Resampling.BICUBIC)
+    return np.asarray(blobs)
+
+
+@pytest.fixture
+def report(photograph, tmp_path) -> Path:
+    """Write a report on a wall 0.5 m away, whose right half is occluded and 25 % confident."""
+    pair = StereoPair(left=photograph[:, :-SHIFT_PX], right=photograph[:, SHIFT_PX:], camera=CAMERA)
+    disparity_px = np.full((240, 320), SHIFT_PX, np.float32)
+    right = np.arange(320) >= 160
+    estimate = Estimate(
+        disparity_px=disparity_px,
+        right_disparity_px=disparity_px,
+        confidence=np.where(right, 0.25, 1).astype(np.float32) * np.ones_like(disparity_px),
+        occluded=np.tile(right, (240, 1)),
+    )
+    summary = summarize(pair, estimate, pictures=("a.png", "b.png"), model="small", estimate_ms=12.34)
+    (tmp_path / "disparity.pfm").write_bytes(b"Pf")
+    context = Context(
+        warnings=("<b>the sides are swapped</b>",),
+        command="stereoweave depth a.png b.png",
+        files=(tmp_path / "disparity.pfm",),
+    )
+    write_report(tmp_path / "report.html", pair, estimate, summary, context)
+    return tmp_path / "report.html"
+
+
+@pytest.fixture
+def page(browser) -> Iterator[Page]:
+    """Yield an empty browser page; the test fails if one of its scripts does."""
+    yield from open_page(browser, width=1200, height=1600)
+
+
+@pytest.fixture
+def phone(browser) -> Iterator[Page]:
+    """Yield a page as narrow as a phone's, with a touch screen and reduced motion."""
+    yield from open_page(browser, width=390, height=844, has_touch=True, reduced_motion="reduce")
+
+
+def open_page(browser: Browser, width: int, height: int, **options) -> Iterator[Page]:
+    page = browser.new_page(viewport={"width": width, "height": height}, **options)
+    page.set_default_timeout(10_000)
+    errors: list[str] = []
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.on("console", lambda said: errors.append(said.text) if said.type == "error" else None)
+    yield page
+    page.close()
+    assert errors == []
+
+
+def choose(page: Page, kind: str) -> None:
+    page.get_by_role("radio", name=kind).check()
+
+
+def shown(page: Page, what: str) -> np.ndarray:
+    """Return what the browser shows of an element, without the button over it."""
+    page.add_style_tag(content=".enlarge { display: none !important; }")
+    return np.asarray(Image.open(io.BytesIO(page.locator(what).screenshot())).convert("RGB")).astype(float)
+
+
+def difference_from_view(page: Page, photograph: np.ndarray, position: float) -> float:
+    """Return the difference between the displayed view and the wall seen from `position`."""
+    found = shown(page, "#stage")
+    moved_px = round(position * SHIFT_PX)
+    expected = Image.fromarray(photograph[:, moved_px : moved_px + 320]).resize(found.shape[1::-1])
+    return float(np.abs(found - np.asarray(expected)).mean())
+
+
+def test_the_slider_changes_the_picture(page, report, photograph):
+    page.goto(report.as_uri())
+    assert difference_from_view(page, photograph, 0.5) < 4
+    assert difference_from_view(page, photograph, 0.75) > 12
+
+    page.focus("#position")
+    for _ in range(5):
+        page.keyboard.press("ArrowRight")
+    assert page.text_content("#where").startswith("0.75, between the cameras")
+    assert difference_from_view(page, photograph, 0.75) < 4
+    assert difference_from_view(page, photograph, 0.5) > 12
+
+    slider = page.locator("#position").bounding_box()
+    left_end = page.locator(".ends span").first.bounding_box()
+    page.mouse.click(left_end["x"] + left_end["width"] / 2, slider["y"] + slider["height"] / 2)
+    assert page.text_content("#where").startswith("0, at the left camera")
+    assert difference_from_view(page, photograph, 0) < 4
+
+
+def test_dragging_the_picture_moves_the_viewpoint_and_does_not_enlarge_it(page, report):
+    page.goto(report.as_uri())
+    stage = page.locator("#stage").bounding_box()
+    middle_y = stage["y"] + stage["height"] / 2
+    page.mouse.move(stage["x"] + stage["width"] / 2, middle_y)
+    page.mouse.down()
+    # Five sixths of the way from -0.25 to 1.25.
+    page.mouse.move(stage["x"] + stage["width"] * 5 / 6, middle_y, steps=4)
+    page.mouse.up()
+    assert page.text_content("#where").startswith("1, at the right camera")
+    assert not page.evaluate("document.getElementById('full').open")
+
+
+@pytest.mark.parametrize(
+    ("share", "ending"), [(0.25, "confidence 100 %"), (0.75, "confidence 25 %, occluded")]
+)
+def test_pointing_at_a_picture_reads_disparity_depth_and_confidence(page, report, share, ending):
+    page.goto(report.as_uri())
+    for picture in page.locator(".frame").all():
+        box = picture.bounding_box()
+        page.mouse.move(box["x"] + box["width"] * share, box["y"] + box["height"] / 2)
+        # 400 px * 0.04 m / 32 px
+        expected = f"({round(320 * share)}, 120): disparity 32.00 px, depth 0.500 m, {ending}"
+        assert page.locator(".reading").all_text_contents() == [expected] * 3
+
+
+def test_the_arrow_keys_read_pixel_by_pixel_and_say_what_they_read(page, report):
+    page.goto(report.as_uri())
+    page.focus("#depth")
+    page.keyboard.press("ArrowLeft")
+    assert page.text_content("#spoken").startswith("(159, 120): disparity 32.00 px")
+    page.keyboard.press("Shift+ArrowDown")
+    assert page.text_content("#spoken").startswith("(159, 140): disparity 32.00 px")
+
+
+def test_a_click_enlarges_a_picture_with_its_read_out_and_escape_puts_it_back(page, report):
+    page.goto(report.as_uri())
+    before = page.locator("#depth").bounding_box()
+    page.locator("#depth").click(position={"x": 20, "y": 20})
+    large = page.locator("dialog #depth").bounding_box()
+    assert large["width"] > 2.5 * before["width"]
+    page.mouse.move(large["x"] + large["width"] / 4, large["y"] + large["height"] / 2)
+    assert page.text_content("dialog .reading").startswith("(80, 120): disparity 32.00 px")
+    page.keyboard.press("Escape")
+    page.wait_for_selector("dialog .card", state="detached")
+    assert page.locator("#depth").bounding_box() == before
+
+
+def test_each_picture_is_enlarged_by_keyboard_and_the_focus_returns(page, report):
+    page.goto(report.as_uri())
+    buttons = page.get_by_role("button", name="Enlarge: ")
+    names = [button.get_attribute("aria-label") for button in buttons.all()]
+    assert names == [f"Enlarge: {name}" for name in ("New views", "Left image", "Depth", "Confidence")]
+    for name in names:
+        page.get_by_role("button", name=name).press("Enter")
+        assert page.get_by_role("dialog", name=name.removeprefix("Enlarge: ")).is_visible()
+        page.keyboard.press("Escape")
+        page.wait_for_selector("dialog .card", state="detached")
+        assert page.evaluate("document.activeElement.getAttribute('aria-label')") == name
+
+
+def test_a_finger_enlarges_a_picture_on_a_phone_which_shows_all_without_scrolling_sideways(phone, report):
+    phone.goto(report.as_uri())
+    assert phone.evaluate("document.documentElement.scrollWidth") <= 390
+    phone.locator("#depth").tap()
+    assert phone.get_by_role("dialog", name="Depth").is_visible()
+    phone.get_by_role("button", name="Close").tap()
+    phone.wait_for_selector("dialog .card", state="detached")
+
+
+def test_the_wiggle_moves_by_itself_until_it_is_paused(page, report):
+    page.goto(report.as_uri())
+    choose(page, "Wiggle")
+    which = "[...document.querySelectorAll('#views img')].findIndex((view) => view.className === 'shown')"
+    page.evaluate(
+        "new Promise((reached) => {"
+        f"  const look = () => {which} === 25 ? reached() : requestAnimationFrame(look);"
+        "  look();"
+        "})"
+    )  # position 1
+    page.get_by_role("button", name="Pause").click()
+    paused = page.evaluate(which)
+    page.evaluate("new Promise((go) => requestAnimationFrame(() => requestAnimationFrame(go)))")
+    assert page.evaluate(which) == paused
+    assert page.get_by_role("button", name="Play").is_visible()
+
+
+def test_the_middle_of_the_scene_stays_in_place_in_the_wiggle(page, report):
+    page.goto(report.as_uri())
+    page.emulate_media(reduced_motion="reduce")
+    page.reload()
+    choose(page, "Wiggle")
+    pictures = []
+    for position in (0, 1):
+        page.evaluate(f"showWiggle({position})")
+        pictures.append(shown(page, "#stage"))
+    # The whole wall is at the median disparity.
+    assert np.abs(pictures[0] - pictures[1]).mean() < 6
+
+
+def test_nothing_moves_by_itself_where_reduced_motion_is_asked_for(phone, report):
+    phone.goto(report.as_uri())
+    choose(phone, "Wiggle")
+    assert phone.get_by_role("button", name="Play").is_visible()
+    assert phone.evaluate("wiggling") == 0
+
+
+def test_the_anaglyph_is_shown_on_request(page, report):
+    page.goto(report.as_uri())
+    before = shown(page, "#stage")
+    choose(page, "Anaglyph")
+    assert page.locator("#anaglyph").is_visible()
+    assert np.abs(shown(page, "#stage") - before).mean() > 5
+    assert page.get_by_text("red-cyan glasses").is_visible()
+    choose(page, "Viewpoint")
+    assert not page.locator("#anaglyph").is_visible()
+
+
+def test_a_warning_stands_above_the_pictures_as_text(page, report):
+    page.goto(report.as_uri())
+    banner = page.locator(".banner")
+    assert banner.inner_text().splitlines()[-1] == "<b>the sides are swapped</b>"
+    assert banner.bounding_box()["y"] < page.locator("#stage").bounding_box()["y"]
+
+
+def test_a_link_opens_the_file_beside_the_report(page, report):
+    page.goto(report.as_uri())
+    page.get_by_role("link", name="disparity.pfm").click()
+    page.wait_for_url("**/disparity.pfm")
+    assert page.inner_text("body") == "Pf"
+
+
+def test_opening_the_report_requests_only_its_own_file(page, report):
+    requested: list[str] = []
+    page.on("request", lambda request: requested.append(request.url))
+    page.goto(report.as_uri())
+    choose(page, "Wiggle")
+    choose(page, "Anaglyph")
+    assert [url for url in requested if not url.startswith("data:")] == [report.as_uri()]
+
+
+def test_the_report_runs_no_script_but_its_own(browser, report):
+    hostile = report.read_text(encoding="utf-8").replace(
+        "</header>", "<script>window.ran = true</script></header>"
+    )
+    report.with_name("hostile.html").write_text(hostile, encoding="utf-8")
+    refused: list[str] = []
+    other = browser.new_page()
+    other.on("console", lambda said: refused.append(said.text))
+    other.goto(report.with_name("hostile.html").as_uri())
+    assert other.evaluate("window.ran") is None
+    assert other.text_content("#where").startswith("0.5, halfway")
+    assert "Content Security Policy" in refused[0]
+    other.close()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_text_contrasts_with_its_background_by_at_least_4_5(page, report, scheme):
+    page.emulate_media(color_scheme=scheme)
+    page.goto(report.as_uri())
+    colours = page.evaluate(
+        "(names) => names.map((name) => getComputedStyle(document.body).getPropertyValue(name).trim())",
+        ["--text", "--quiet", "--accent", "--card", "--page", "--warn-text", "--warn"],
+    )
+    text, quiet, accent, card, ground, warn_text, warn = map(luminance, colours)
+    for front, back in [*((f, b) for f in (text, quiet, accent) for b in (card, ground)), (warn_text, warn)]:
+        assert (max(front, back) + 0.05) / (min(front, back) + 0.05) >= 4.5
+
+
+def luminance(colour: str) -> float:
+    """Return the relative luminance of a colour such as #1b1f27 (WCAG 2.2)."""
+    share = np.array([int(colour[at : at + 2], 16) for at in (1, 3, 5)]) / 255
+    light = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    return float(light @ (0.2126, 0.7152, 0.0722))
