@@ -75,6 +75,7 @@ function chooseMode(mode) {
   setWiggling(false);
   document.getElementById("views").style.transform = "";
   document.getElementById("anaglyph").classList.toggle("shown", mode === "anaglyph");
+  showScene(mode === "turn");
   if (mode === "wiggle") {
     showWiggle(0.5);
     setWiggling(!still);
@@ -82,6 +83,27 @@ function chooseMode(mode) {
 }
 for (const choice of document.querySelectorAll("[name=mode]")) {
   choice.addEventListener("change", () => chooseMode(choice.value));
+}
+
+// --- The 3-D view: see report_scene.js ---
+
+const canvas = document.getElementById("scene");
+let scene = null;
+
+async function showScene(on) {
+  canvas.hidden = !on;
+  scene?.stop();
+  if (!on) return;
+  if (!scene) {
+    const picture = document.querySelector(".frame img");
+    await Promise.all([unpacked, picture.decode()]);
+    scene = startScene(canvas, picture, maps);
+    if (!scene) document.getElementById("turning").textContent = "This browser has no WebGL 2, which the 3-D view needs.";
+  }
+  if (scene && !still && !canvas.hidden) scene.sway();
+}
+for (const [id, use] of [["nearer", () => scene?.zoom(1 / 1.15)], ["farther", () => scene?.zoom(1.15)], ["again", () => scene?.reset()]]) {
+  document.getElementById(id).addEventListener("click", use);
 }
 
 // Dragging the picture sideways moves the viewpoint.
@@ -174,7 +196,7 @@ for (const frame of frames) {
   frame.setAttribute("role", "group");
   frame.setAttribute("aria-label", frame.querySelector("img").alt + ": arrow keys read the values");
 }
-unpackMaps();
+const unpacked = unpackMaps();
 
 // --- The full window: the picture's whole card moves into a dialog ---
 
@@ -216,7 +238,7 @@ for (const picture of [stage, ...frames]) {
   let fromX = 0, fromY = 0;
   picture.addEventListener("pointerdown", (event) => ([fromX, fromY] = [event.clientX, event.clientY]));
   picture.addEventListener("click", (event) => {
-    // A drag is no click.
-    if (Math.hypot(event.clientX - fromX, event.clientY - fromY) < 5) enlarge(picture, button);
+    // A drag is no click, and the 3-D view is dragged.
+    if (event.target !== canvas && Math.hypot(event.clientX - fromX, event.clientY - fromY) < 5) enlarge(picture, button);
   });
 }

@@ -38,6 +38,11 @@ POSITIONS = tuple(step / _VIEWS_PER_BASELINE for step in range(-5, 26))
 
 _LONGER_SIDE_PX = 1000
 _LONGER_SIDE_OF_MAP_PX = 640
+# The 3-D view shows what is farther than this multiple of the distance about which it turns there.
+_FARTHEST = 4.0
+_LEAST_MIDDLE_PX = 1.0
+# Largest difference of disparity, per pixel, on one surface of the 3-D view; a larger one is an edge.
+_STEEPEST = 1.0
 # Beyond it, the disparity says no more than "far".
 _FAR_M = 10_000
 
@@ -152,6 +157,7 @@ def _collect_fields(
         "height_px": summary.height_px,
         "camera": asdict(pair.camera) if pair.camera else None,
         "map": pack_map(*_downscale_map(pair, estimate)),
+        "scene": _place_scene(pair, estimate),
         **views.data,
     }
     size = f"{summary.width_px} × {summary.height_px} px"
@@ -257,6 +263,39 @@ def _downscale_map(pair: StereoPair, estimate: Estimate) -> tuple[np.ndarray, np
         _resize_nearest(confidence, size),
         _resize_nearest(estimate.occluded, size),
     )
+
+
+def _place_scene(pair: StereoPair, estimate: Estimate) -> dict[str, float]:
+    """Return the camera of the 3-D view, in px of the pair and in baselines.
+
+    The view turns about the distance `middle`, that of the disparity halfway between the least and the
+    greatest one, outliers aside. What is farther than `farthest` is shown there. Without a camera, or with
+    one for which the middle is infinitely far, one with a field of view of 53 degrees is assumed, and the
+    least disparity is taken to be at infinity.
+    """
+    least_px, greatest_px = np.percentile(estimate.disparity_px[_seen(pair)], [1, 99]).tolist()
+    halfway_px = (least_px + greatest_px) / 2
+    height, width = estimate.disparity_px.shape
+    camera = pair.camera
+    if camera is None or halfway_px + camera.doffs_px < _LEAST_MIDDLE_PX:
+        camera = StereoCamera(
+            focal_px=width,
+            baseline_m=1,
+            cx_px=(width - 1) / 2,
+            cy_px=(height - 1) / 2,
+            doffs_px=max(0.0, -least_px, _LEAST_MIDDLE_PX - halfway_px),
+        )
+    middle_px = halfway_px + camera.doffs_px
+    return {
+        "focal_px": camera.focal_px,
+        "cx_px": camera.cx_px,
+        "cy_px": camera.cy_px,
+        "doffs_px": camera.doffs_px,
+        "least_px": middle_px / _FARTHEST,
+        "steepest_px": _STEEPEST * max(1.0, max(height, width) / _LONGER_SIDE_OF_MAP_PX),
+        "middle": camera.focal_px / middle_px,
+        "farthest": _FARTHEST * camera.focal_px / middle_px,
+    }
 
 
 def _list_numbers(summary: Summary) -> list[tuple[str, str]]:

@@ -1,6 +1,6 @@
 """Parts of the report's HTML: the page around them, encoded images and maps, and escaped lists.
 
-report.html, report.css and report.js are package data. All text is escaped here.
+The template, the style and the scripts are package data. All text is escaped here.
 """
 
 import base64
@@ -46,11 +46,11 @@ _FINEST_STEP_PX = 1 / 64
 
 
 def fill_template(fields: Mapping[str, object]) -> str:
-    """Return the page: report.html with its style, its script and the given fields, which are HTML.
+    """Return the page: report.html with its style, its scripts and the given fields, which are HTML.
 
-    The page may run only this script: its checksum is part of the content security policy.
+    The page may run only these scripts: their checksum is part of the content security policy.
     """
-    style, script = _read("report.css"), _read("report.js")
+    style, script = _read("report.css"), _read("report.js") + _read("report_scene.js")
     checksum = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     return string.Template(_read("report.html")).substitute(
         fields, style=style, script=script, checksum=f"sha256-{checksum}"

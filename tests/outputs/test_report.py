@@ -1,9 +1,11 @@
 import base64
 import io
+import json
 import re
 import zlib
 from dataclasses import replace
 from datetime import UTC, datetime
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -214,6 +216,33 @@ def test_the_packed_map_holds_disparity_confidence_and_occlusion(rng, reach_px, 
     known = ~np.isnan(confidence)
     np.testing.assert_allclose(planes[2][known] % 128 / 100, confidence[known], atol=0.0051)
     np.testing.assert_array_equal(planes[2][known] >= 128, occluded[known])
+
+
+def scene_of(folder: Path, pair: StereoPair, estimate: Estimate) -> dict[str, float]:
+    write_report(folder / "report.html", pair, estimate, summary_of(pair, estimate, "a.png"), Context())
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    (data,) = re.findall(r'id="data">(.*?)</script>', page)
+    return json.loads(data)["scene"]
+
+
+def test_the_3_d_view_turns_about_the_middle_of_the_disparities_in_baselines(rng, tmp_path):
+    photograph = texture(rng, 60, 132)
+    with_camera = scene_of(tmp_path, *wall(photograph, SHIFT_PX, CAMERA))
+    # 400 px / 32 px, and four times that
+    assert (with_camera["middle"], with_camera["farthest"]) == (12.5, 50)
+    assert with_camera["least_px"] == SHIFT_PX / 4
+    without = scene_of(tmp_path, *wall(photograph, SHIFT_PX, None))
+    assert (without["focal_px"], without["cx_px"], without["doffs_px"]) == (100, 49.5, 0)
+    assert without["middle"] == 100 / 32
+
+
+def test_a_scene_that_is_infinitely_far_for_its_camera_is_shown_as_without_a_camera(rng, tmp_path):
+    toed_in = StereoCamera(focal_px=400, baseline_m=0.04, cx_px=0, cy_px=0, doffs_px=-SHIFT_PX)
+    scene = scene_of(tmp_path, *wall(texture(rng, 60, 132), SHIFT_PX, toed_in))
+    assert (scene["focal_px"], scene["middle"]) == (100, 100 / 32)
+    pair, estimate = wall(texture(rng, 60, 132), SHIFT_PX, None)
+    estimate = replace(estimate, disparity_px=estimate.disparity_px - 72)
+    assert scene_of(tmp_path, pair, estimate)["doffs_px"] == 41  # the whole wall at -40 px: moved to 1 px
 
 
 def test_each_file_of_a_result_is_described_in_the_report():

@@ -4,6 +4,7 @@ import io
 from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from browsers import chromium
@@ -232,6 +233,79 @@ def test_the_anaglyph_is_shown_on_request(page, report):
     assert page.get_by_text("red-cyan glasses").is_visible()
     choose(page, "Viewpoint")
     assert not page.locator("#anaglyph").is_visible()
+
+
+def test_the_3_d_view_starts_as_the_left_image_and_turns_about_the_middle_of_the_scene(
+    page, report, photograph
+):
+    """The wall is a plane at the distance about which it turns, so each view is a homography of it."""
+    page.emulate_media(reduced_motion="reduce")
+    page.goto(report.as_uri())
+    choose(page, "3-D")
+    page.wait_for_selector("#scene")
+    left = photograph[:, :-SHIFT_PX]
+    assert difference_from_turned(page, left, turned=0.0, away=1.0) < 4
+
+    page.focus("#scene")
+    for _ in range(4):
+        page.keyboard.press("ArrowRight")
+    assert difference_from_turned(page, left, turned=0.4, away=1.0) < 4
+    assert difference_from_turned(page, left, turned=-0.4, away=1.0) > 12
+
+    page.get_by_role("button", name="Start again").click()
+    for _ in range(3):
+        page.get_by_role("button", name="Zoom out").click()
+    assert difference_from_turned(page, left, turned=0.0, away=1.15**3) < 5
+    assert difference_from_turned(page, left, turned=0.0, away=1.0) > 12
+
+
+def difference_from_turned(page: Page, left: np.ndarray, turned: float, away: float) -> float:
+    """Return how the 3-D view differs from the wall turned so that what is near moves right.
+
+    `turned` is an angle in radians, and `away` the wall's distance in multiples of its first distance. Only
+    what the turned wall covers, less a margin, is compared.
+    """
+    page.evaluate("new Promise((drawn) => requestAnimationFrame(() => requestAnimationFrame(drawn)))")
+    found = shown(page, "#stage")
+    height, width = found.shape[:2]
+    to_given = np.diag([320 / width, 240 / height, 1.0])
+    # A point c px right of and r px below the principal point: c / f and r / f, in distances of the wall.
+    inner = np.array([[1 / 400, 0, -160 / 400], [0, 1 / 400, -60 / 400], [0, 0, 1]])
+    turn = np.array([[np.cos(turned), 0, 0], [0, 1, 0], [np.sin(turned), 0, away]])
+    matrix = np.linalg.inv(to_given) @ np.linalg.inv(inner) @ turn @ inner
+    expected = cv2.warpPerspective(left, matrix, (width, height)).astype(float)
+    covered = cv2.erode(cv2.warpPerspective(np.ones_like(left), matrix, (width, height)), np.ones((21, 21)))
+    assert covered.mean() > 0.2
+    return float(np.abs(found - expected)[covered > 0].mean())
+
+
+def test_dragging_the_3_d_view_turns_it_and_does_not_enlarge_it(page, report):
+    page.emulate_media(reduced_motion="reduce")
+    page.goto(report.as_uri())
+    choose(page, "3-D")
+    box = page.locator("#scene").bounding_box()
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    page.mouse.down()
+    page.mouse.move(box["x"] + box["width"] * 0.75, box["y"] + box["height"] / 2, steps=4)
+    page.mouse.up()
+    # The whole width would turn it by 2 radians.
+    assert page.evaluate("scene.pose.yaw") == pytest.approx(-0.5, abs=0.01)
+    assert page.evaluate("scene.pose.pitch") == 0
+    assert not page.evaluate("full.open")
+
+
+def test_triangles_join_one_surface_and_leave_out_what_the_left_image_does_not_cover(page, report):
+    page.goto(report.as_uri())
+    maps = "{ levels: [10, 11, 30, 10, 11, 30], percents: [99, 99, 99, 99, 255, 99] }"
+    whole = maps.replace("255", "99")
+    all_corners = [0, 3, 1, 1, 3, 4, 1, 4, 2, 2, 4, 5]
+    for given, steepest_px, corners in (
+        (maps, 100, [0, 3, 1]),
+        (whole, 100, all_corners),
+        (whole, 1, all_corners[:6]),
+    ):
+        map_ = "{ width: 3, height: 2, step_px: 1 }"
+        assert page.evaluate(f"[...triangulate({given}, {map_}, {steepest_px})]") == corners
 
 
 def test_a_warning_stands_above_the_pictures_as_text(page, report):
