@@ -257,6 +257,7 @@ def test_the_3_d_view_starts_as_the_left_image_and_turns_about_the_middle_of_the
         page.get_by_role("button", name="Zoom out").click()
     assert difference_from_turned(page, left, turned=0.0, away=1.15**3) < 5
     assert difference_from_turned(page, left, turned=0.0, away=1.0) > 12
+    assert shown(page, "#stage")[-30:-15].max() < 40  # below the wall there is nothing
 
 
 def difference_from_turned(page: Page, left: np.ndarray, turned: float, away: float) -> float:
