@@ -45,6 +45,8 @@ def _find_ends(masks: list[Bool[np.ndarray, "h w"]]) -> tuple[int, int]:
 
 
 def _measure_border(mask: Bool[np.ndarray, "h w"]) -> int:
-    """Return the columns before the first True of a row, for all rows but the few widest."""
-    before = np.where(mask.any(1), mask.argmax(1), mask.shape[1])
-    return int(np.percentile(before, _ROWS_PERCENT, method="inverted_cdf"))
+    """Return the columns before the first True of a row, for all rows with one but the few widest."""
+    known = mask[mask.any(1)]
+    if not len(known):
+        return mask.shape[1]
+    return int(np.percentile(known.argmax(1), _ROWS_PERCENT, method="inverted_cdf"))

@@ -18,9 +18,9 @@ FLAGS = (
 
 
 @contextmanager
-def chromium(*flags: str) -> Iterator[Browser]:
-    """Yield a headless Chromium, started with further flags, that closes at the end of the block."""
+def chromium() -> Iterator[Browser]:
+    """Yield a headless Chromium that closes at the end of the block."""
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=(*FLAGS, *flags))
+        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS)
         yield browser
         browser.close()
