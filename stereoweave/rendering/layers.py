@@ -20,6 +20,7 @@ from stereoweave.system.threads import in_bands, thread_count
 _FURTHER = 0.25
 _BAND_ROWS = 60
 _MEDIAN_PX = 5
+_PASSES = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,8 +93,9 @@ def make_layers(
     behind[by_right], behind_px[by_right] = seen_colours[by_right], seen_px[by_right]
     invented &= ~by_right
     # The rows are continued one by one; their median joins them.
-    for values in (behind, behind_px):
-        values[invented] = cv2.medianBlur(values, _MEDIAN_PX)[invented]
+    for _ in range(_PASSES):
+        for values in (behind, behind_px):
+            values[invented] = cv2.medianBlur(values, _MEDIAN_PX)[invented]
     return Layers(
         front=front,
         front_px=front_px,

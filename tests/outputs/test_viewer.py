@@ -1,6 +1,7 @@
 """The 3-D viewer in a browser shows what the cameras saw, and what the renderer renders between them."""
 
 import base64
+import html
 import io
 import json
 import re
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 from browsers import FLAGS, chromium
 from PIL import Image
-from playwright.sync_api import Browser, BrowserContext, Page
+from playwright.sync_api import Browser, BrowserContext, Frame, Page
 
 from stereoweave.outputs.viewer import make_viewer, viewer_script, write_viewer
 from stereoweave.outputs.viewer_scene import POSITIONS, pack_scene
@@ -75,6 +76,11 @@ def browser() -> Iterator[Browser]:
         yield browser
 
 
+def start(browser: Browser, *flags: str) -> Browser:
+    """Start another Chromium with further flags."""
+    return browser.browser_type.launch(executable_path=shutil.which("chromium"), args=[*FLAGS, *flags])
+
+
 def open_page(place: Browser | BrowserContext, path: Path, **options) -> Page:
     """Open the page, and wait until the viewer is ready."""
     page = place.new_page(**options)
@@ -84,7 +90,7 @@ def open_page(place: Browser | BrowserContext, path: Path, **options) -> Page:
     return page
 
 
-def wait_until(page: Page, condition: str) -> None:
+def wait_until(page: Page | Frame, condition: str) -> None:
     """Wait for a condition, frame by frame: the page's policy forbids what Playwright's own waiting does."""
     for _ in range(1000):
         if page.evaluate(condition):
@@ -241,9 +247,7 @@ def test_without_webgl_or_scripts_the_left_picture_is_shown_with_the_reason(brow
         left, top, width, height = packed(photo)["shown_px"]
         return np.asarray(shown.resize((round(width), round(height))))
 
-    plain = browser.browser_type.launch(
-        executable_path=shutil.which("chromium"), args=[*FLAGS, "--disable-3d-apis"]
-    )
+    plain = start(browser, "--disable-3d-apis")
     page = plain.new_page()
     page.goto(photo.as_uri())
     wait_until(page, "document.getElementById('hint').textContent.includes('has no WebGL')")
@@ -254,6 +258,28 @@ def test_without_webgl_or_scripts_the_left_picture_is_shown_with_the_reason(brow
     page.goto(photo.as_uri())
     assert "needs JavaScript and WebGL" in page.locator("#hint").inner_text()
     assert difference(still_on(page), cut(scene[0].left, photo)).mean() < 12
+
+
+@pytest.mark.needs_chromium
+def test_webgl_1_is_enough(browser, photo, scene):
+    old = start(browser, "--disable-webgl2")
+    page = open_page(old, photo)
+    assert page.evaluate("stereoweaveViewer.view.gl.constructor.name") == "WebGLRenderingContext"
+    assert difference(seen_from(page, 0), cut(scene[0].left, photo)).mean() < 4
+    old.close()
+
+
+@pytest.mark.needs_chromium
+def test_the_page_works_in_a_frame_of_a_page_with_a_policy_of_its_own(browser, photo, tmp_path):
+    policy = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
+    (tmp_path / "outer.html").write_text(
+        f'<meta http-equiv="Content-Security-Policy" content="{policy}">'
+        f'<iframe srcdoc="{html.escape(photo.read_text(encoding="utf-8"))}"></iframe>',
+        encoding="utf-8",
+    )
+    page = browser.new_page()
+    page.goto((tmp_path / "outer.html").as_uri())
+    wait_until(page.frames[1], "Boolean(window.stereoweaveViewer)")
 
 
 @pytest.mark.needs_chromium

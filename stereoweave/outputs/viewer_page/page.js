@@ -10,6 +10,7 @@ async function startPage() {
     return;
   }
   element("view").hidden = false;
+  element("still").setAttribute("aria-hidden", "true");
   const touches = matchMedia("(pointer: coarse)").matches;
   element("hint").textContent = touches ? "Drag to look around" : "Move the mouse to look around";
   element("sway").hidden = false;
