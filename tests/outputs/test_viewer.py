@@ -219,6 +219,24 @@ def test_a_finger_drags_the_view_on_a_phone(browser, photo):
 
 
 @pytest.mark.needs_chromium
+def test_tilting_a_phone_moves_the_view_once_that_is_allowed(browser, photo):
+    phone = browser.new_context(
+        viewport={"width": 390, "height": 844}, is_mobile=True, has_touch=True, reduced_motion="reduce"
+    )
+    page = open_page(phone, photo)
+    held = phone.new_cdp_session(page)
+    tilt = "DeviceOrientation.setDeviceOrientationOverride"
+    held.send(tilt, {"alpha": 0, "beta": 40, "gamma": 0})
+    page.get_by_role("button", name="Tilt to look around").click()
+    page.get_by_role("button", name="Tilt to look around").wait_for(state="hidden")
+    page.evaluate(FRAMES, 10)
+    assert page.evaluate("stereoweaveViewer.target") == [0, 0]  # the way in which it is held is the middle
+    held.send(tilt, {"alpha": 0, "beta": 40, "gamma": 9})
+    wait_until(page, "stereoweaveViewer.eye[0] > 0.4")
+    phone.close()
+
+
+@pytest.mark.needs_chromium
 def test_arrow_keys_move_the_view(browser, photo):
     page = open_page(browser.new_context(reduced_motion="reduce"), photo)
     page.focus("#view")

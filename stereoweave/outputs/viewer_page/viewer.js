@@ -8,8 +8,8 @@ const IDENTITY = new Float32Array([1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 
 const VERTEX_SHADER = $vertex_shader;
 const FRAGMENT_SHADER = $fragment_shader;
 
-/** Return a promise of {draw, resize, shown}, or of null where the browser has no WebGL.
-    scene: the packed scene; `front` may be an image element instead of an address. */
+/** Return a promise of {draw, drawWith, gl, scene}, or of null where the browser has no WebGL.
+    scene: the packed scene; its images may be image elements instead of addresses. */
 async function makeView(canvas, scene) {
   const options = { alpha: false, antialias: false, depth: false, xrCompatible: false };
   const gl = canvas.getContext("webgl2", options) || canvas.getContext("webgl", options);
@@ -71,7 +71,7 @@ async function makeView(canvas, scene) {
 }
 
 /** Add a viewer to a canvas: it moves with the mouse, a finger, the arrow keys, or by itself when idle.
-    Return a promise of the viewer, or of null where the browser has no WebGL.
+    Return a promise of the viewer, {look, stop, sway, eye, target, view}, or of null where the browser has no WebGL.
     options.area: the element whose mouse and touch events move the view (default: the canvas);
     options.sway: whether the view moves by itself (default: unless the reader asked for less motion). */
 async function makeViewer(canvas, scene, options = {}) {
@@ -81,14 +81,13 @@ async function makeViewer(canvas, scene, options = {}) {
   const [first, last] = scene.positions;
   const middle = (first + last) / 2, reach = (last - first) / 2;
   const calm = matchMedia("(prefers-reduced-motion: reduce)").matches;
-  const viewer = { view, sway: options.sway ?? !calm, target: [0, 0], eye: [0, 0], moved: false };
+  const viewer = { view, sway: options.sway ?? !calm, target: [0, 0], eye: [0, 0] };
   let touched_ms = -1e9, previous_ms = 0, drawn = null, sharpness = 1, slow = 0, visible = true, dragged = null;
 
   /** Look from (u, v), each -1 to 1, to the right and up. */
   viewer.look = (u, v) => {
     viewer.target = [clamp(u, -1, 1), clamp(v, -1, 1)];
     touched_ms = performance.now();
-    viewer.moved = true;
   };
   viewer.stop = () => { visible = false; watcher?.disconnect(); viewer.stopped = true; };
 
