@@ -52,7 +52,7 @@ def test_from_above_the_upper_rows_are_cut_off(pair):
 
 def test_views_with_too_little_in_common_are_refused(pair):
     renderer = Renderer(*pair, convergence_px=90, threads=1)
-    # The left image is shifted by 45 px to the left, of which the right image fills 8; and the other way round.
+    # The left image is shifted by 45 px to the left, of which the right image fills 8, and vice versa.
     with pytest.raises(StereoweaveError) as error:
         find_common_part(renderer, [0.0, 1.0])
     assert str(error.value) == (
