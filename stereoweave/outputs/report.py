@@ -20,7 +20,7 @@ from stereoweave.io.colormap import (
     legend_colours,
 )
 from stereoweave.io.text import writing_text
-from stereoweave.outputs.report_page import (
+from stereoweave.outputs.report_parts import (
     download_list,
     fill_template,
     jpeg_uri,
@@ -29,12 +29,13 @@ from stereoweave.outputs.report_page import (
     term_list,
     view_tags,
 )
-from stereoweave.rendering.layouts import LAYOUTS, LayoutOptions, median_disparity_px
+from stereoweave.outputs.viewer_scene import pack_scene
+from stereoweave.rendering.layouts import LAYOUTS, LayoutOptions, median_disparity_px, render_views
 from stereoweave.rendering.renderer import Renderer
 from stereoweave.stereo import Estimate, StereoCamera, StereoPair
 
-_VIEWS_PER_BASELINE = 20
-POSITIONS = tuple(step / _VIEWS_PER_BASELINE for step in range(-5, 26))
+# Views for browsers without WebGL; others show the view from any position.
+POSITIONS = (0.0, 0.25, 0.5, 0.75, 1.0)
 
 _LONGER_SIDE_PX = 1000
 _LONGER_SIDE_OF_MAP_PX = 640
@@ -131,8 +132,8 @@ def write_report(
 ) -> None:
     """Write the report as a single HTML file, which loads no other file.
 
-    The report shows the warnings, the views from POSITIONS with a slider to move the viewpoint, a wiggle, an
-    anaglyph, the left image, the depth (or the disparity if the camera is unknown), the confidence, the
+    The report shows the warnings, new views with a slider to move the viewpoint, a wiggle, an anaglyph, the
+    left image in 3-D and plain, the depth (or the disparity if the camera is unknown), the confidence, the
     summary, and how the result was made. It links to the context's files. Images have at most 1000 px on the
     longer side.
     """
@@ -170,7 +171,6 @@ def _collect_fields(
         "height": height,
         **views.fields,
         "numbers": term_list(_list_numbers(summary)),
-        "left": jpeg_uri(small.left),
         "depth_name": "Depth" if pair.camera else "Disparity",
         "depth": jpeg_uri(depth),
         "confidence": jpeg_uri(colour_confidence(small_estimate.confidence, small_estimate.occluded)),
@@ -193,30 +193,25 @@ class _Views(NamedTuple):
 
 
 def _show_views(pair: StereoPair, estimate: Estimate, threads: int | None) -> _Views:
-    """Render the views from POSITIONS and the anaglyph of a pair that is small enough to display."""
-    renderer = Renderer(pair, estimate, threads=threads)
-    views = [renderer.view(position) for position in POSITIONS]
+    """Prepare the new views and the anaglyph of a pair that is small enough to display."""
     width = pair.left.shape[1]
     # A matcher file may give more, which no view can be moved by.
     middle_px = float(np.clip(median_disparity_px(estimate), -width, width))
-    converged = Renderer(pair, estimate, convergence_px=middle_px, threads=threads)
-    anaglyph = LAYOUTS["anaglyph_dubois"].compose(converged, LayoutOptions())
+    renderer = Renderer(pair, estimate, convergence_px=middle_px, threads=threads)
+    photo = pack_scene(pair, estimate, convergence_px=middle_px, threads=threads)
+    first, last = photo["positions"]
+    left_end, right_end = (f"{100 * (position - first) / (last - first):.2f}%" for position in (0, 1))
     return _Views(
         fields={
-            "views": view_tags(POSITIONS, [view.image for view in views]),
-            "first": POSITIONS[0],
-            "last": POSITIONS[-1],
-            "step": POSITIONS[1] - POSITIONS[0],
-            "left_end": _along_slider(0),
-            "right_end": _along_slider(1),
-            "anaglyph": jpeg_uri(anaglyph),
+            "views": view_tags(POSITIONS, list(render_views(renderer, POSITIONS))),
+            "first": first,
+            "last": last,
+            "left_end": left_end,
+            "right_end": right_end,
+            "left": photo.pop("front"),
+            "anaglyph": jpeg_uri(LAYOUTS["anaglyph_dubois"].compose(renderer, LayoutOptions())),
         },
-        data={
-            "first_view": POSITIONS[0],
-            "views_per_baseline": _VIEWS_PER_BASELINE,
-            "middle_share": middle_px / width,
-            "invented_percent": [round(100 * float((~view.drawn).mean()), 2) for view in views],
-        },
+        data={"photo": photo, "positions": POSITIONS},
     )
 
 
@@ -368,7 +363,3 @@ def _format_time(summary: Summary) -> str:
 
 def _round(value: float) -> float:
     return round(float(value), 4)
-
-
-def _along_slider(position: float) -> str:
-    return f"{100 * (position - POSITIONS[0]) / (POSITIONS[-1] - POSITIONS[0]):.2f}%"

@@ -41,7 +41,7 @@ from stereoweave.outputs.point_cloud import (
     write_ply,
 )
 from stereoweave.outputs.report import Context, Summary, write_report
-from stereoweave.outputs.report_page import CONTENTS
+from stereoweave.outputs.report_parts import CONTENTS
 from stereoweave.outputs.run import Result, run
 from stereoweave.pictures.prepare import Request, prepare
 from stereoweave.stereo import StereoPair

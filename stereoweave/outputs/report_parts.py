@@ -1,6 +1,6 @@
 """Parts of the report's HTML: the page around them, encoded images and maps, and escaped lists.
 
-The template, the style and the scripts are package data. All text is escaped here.
+The template, the style and the scripts are in report_page/. All text is escaped here.
 """
 
 import base64
@@ -15,6 +15,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
+
+from stereoweave.outputs.viewer import viewer_script
 
 # What the result's files contain. The report links to those that were written with it.
 CONTENTS = {
@@ -36,9 +38,6 @@ CONTENTS = {
 }
 
 _QUALITY = 88
-# Qualities of the views, from best to worst; the first one that keeps all of them below the limit is used.
-_QUALITIES = (85, 80, 75, 70, 65, 60, 50, 40, 30)
-_MOST_BYTES_OF_VIEWS = 2_600_000
 # A confidence is stored as 0 to 100; occluded pixels have 128 added.
 _OCCLUDED = 128
 _NOT_SEEN = 255
@@ -46,13 +45,13 @@ _FINEST_STEP_PX = 1 / 64
 
 
 def fill_template(fields: Mapping[str, object]) -> str:
-    """Return the page: report.html with its style, its scripts and the given fields, which are HTML.
+    """Return the page: the template with its style, its scripts and the given fields, which are HTML.
 
     The page may run only these scripts: their checksum is part of the content security policy.
     """
-    style, script = _read("report.css"), _read("report.js") + _read("report_scene.js")
+    style, script = _read("page.css"), "".join([_read("mesh.js"), viewer_script(), _read("page.js")])
     checksum = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    return string.Template(_read("report.html")).substitute(
+    return string.Template(_read("page.html")).substitute(
         fields, style=style, script=script, checksum=f"sha256-{checksum}"
     )
 
@@ -87,17 +86,17 @@ def download_list(files: Sequence[Path]) -> str:
 
 
 def view_tags(positions: Sequence[float], images: Sequence[UInt8[np.ndarray, "h w 3"]]) -> str:
-    """Return the tags of the views, whose images share one quality that limits their total size."""
-    for quality in _QUALITIES:
-        encoded = [_encode_jpeg(image, quality) for image in images]
-        if sum(map(len, encoded)) <= _MOST_BYTES_OF_VIEWS:
-            break
-    return "\n".join(map(_view_tag, positions, encoded))
+    """Return the tags of the views; the middle one is visible even with scripts disabled."""
+    return "\n".join(map(_view_tag, positions, images))
 
 
 def jpeg_uri(image: UInt8[np.ndarray, "h w 3"]) -> str:
     """Encode an image as a JPEG data URI."""
-    return _data_uri(_encode_jpeg(image, _QUALITY))
+    encoded, jpeg = cv2.imencode(
+        ".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
+    )
+    assert encoded
+    return "data:image/jpeg;base64," + base64.b64encode(jpeg.tobytes()).decode()
 
 
 def pack_map(
@@ -134,25 +133,13 @@ def pack_map(
 
 
 def _read(name: str) -> str:
-    return (importlib.resources.files("stereoweave.outputs") / name).read_text(encoding="utf-8")
+    source = importlib.resources.files("stereoweave.outputs") / "report_page" / name
+    return source.read_text(encoding="utf-8")
 
 
-def _view_tag(position: float, jpeg: bytes) -> str:
-    # The middle view is visible even with scripts disabled.
+def _view_tag(position: float, image: UInt8[np.ndarray, "h w 3"]) -> str:
     shown = ' class="shown"' if position == 0.5 else ""
-    return f'<img{shown} decoding="sync" src="{_data_uri(jpeg)}" alt="View at position {position}">'
-
-
-def _encode_jpeg(image: UInt8[np.ndarray, "h w 3"], quality: int) -> bytes:
-    encoded, jpeg = cv2.imencode(
-        ".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality]
-    )
-    assert encoded
-    return jpeg.tobytes()
-
-
-def _data_uri(jpeg: bytes) -> str:
-    return "data:image/jpeg;base64," + base64.b64encode(jpeg).decode()
+    return f'<img{shown} decoding="sync" src="{jpeg_uri(image)}" alt="View at position {position}">'
 
 
 def _format_size(count: int) -> str:

@@ -1,6 +1,7 @@
 // The 3-D view: the left image as a mesh that turns about the middle of the scene. It starts at the left camera.
+"use strict";
 
-const VERTEX_SHADER = `#version 300 es
+const MESH_VERTEX_SHADER = `#version 300 es
 in float level;
 uniform ivec2 size;         // of the map
 uniform vec2 scale;         // px of the pair per px of the map
@@ -17,7 +18,7 @@ void main() {
   gl_Position = matrix * vec4((cell * scale - 0.5 - centre) * z / lens.x, z, 1.0);
 }`;
 
-const FRAGMENT_SHADER = `#version 300 es
+const MESH_FRAGMENT_SHADER = `#version 300 es
 precision mediump float;
 in vec2 place;
 uniform sampler2D picture;
@@ -70,7 +71,7 @@ function sceneMatrix(pose, scene, size_px) {
   return new Float32Array([0, 1, 2, 3].flatMap(column));
 }
 
-function startScene(canvas, picture, maps) {
+function startMesh(canvas, picture, maps) {
   const gl = canvas.getContext("webgl2");
   if (!gl) return null;
   const { map, scene } = data, size_px = [data.width_px, data.height_px];
@@ -80,7 +81,7 @@ function startScene(canvas, picture, maps) {
 
   function build() {
     const program = gl.createProgram();
-    for (const [kind, source] of [[gl.VERTEX_SHADER, VERTEX_SHADER], [gl.FRAGMENT_SHADER, FRAGMENT_SHADER]]) {
+    for (const [kind, source] of [[gl.VERTEX_SHADER, MESH_VERTEX_SHADER], [gl.FRAGMENT_SHADER, MESH_FRAGMENT_SHADER]]) {
       const shader = gl.createShader(kind);
       gl.shaderSource(shader, source);
       gl.compileShader(shader);

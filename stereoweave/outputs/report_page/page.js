@@ -1,25 +1,38 @@
-"use strict";
 const data = JSON.parse(document.getElementById("data").textContent);
 const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
 const stage = document.getElementById("stage");
 document.body.classList.add("alive");
 
-// --- The views: a slider, or a wiggle ---
+// --- The view from any position: by WebGL, or the nearest of a few images ---
 
 const slider = document.getElementById("position");
 const views = document.querySelectorAll("#views img");
+const photo = document.getElementById("photo");
+const shownFrom = { position: 0.5, up: 0 };
+let photoView = null;
 
-function indexOf(position) {
-  const index = Math.round((position - data.first_view) * data.views_per_baseline);
-  return Math.min(Math.max(index, 0), views.length - 1);
+function showFrom(position, up) {
+  Object.assign(shownFrom, { position, up });
+  if (photoView) return photoView.draw(position, up);
+  const distances = data.positions.map((at) => Math.abs(at - position));
+  const nearest = distances.indexOf(Math.min(...distances));
+  views.forEach((view, i) => view.classList.toggle("shown", i === nearest));
 }
 
-function positionOf(index) {
-  return Math.round(data.first_view * data.views_per_baseline + index) / data.views_per_baseline;
+async function startPhoto() {
+  const front = document.querySelector(".frame img");
+  photoView = await StereoweaveViewer.makeView(photo, { ...data.photo, front });
+  if (!photoView) return;
+  photo.hidden = false;
+  new ResizeObserver(fitPhoto).observe(photo);
+  photo.addEventListener("webglcontextrestored", fitPhoto);
 }
 
-function showView(index) {
-  views.forEach((view, i) => view.classList.toggle("shown", i === index));
+function fitPhoto() {
+  const [, , width_px, height_px] = data.photo.shown_px;
+  photo.width = Math.max(1, Math.min(Math.round(photo.clientWidth * devicePixelRatio), Math.round(1.25 * width_px)));
+  photo.height = Math.max(1, Math.round((photo.width * height_px) / width_px));
+  showFrom(shownFrom.position, shownFrom.up);
 }
 
 function place(position) {
@@ -28,33 +41,25 @@ function place(position) {
   return { 0: "at the left camera", 0.5: "halfway between the cameras", 1: "at the right camera" }[position] ?? "between the cameras";
 }
 
-function moveViewpoint() {
-  const index = indexOf(Number(slider.value)), position = positionOf(index);
-  showView(index);
-  const invented = data.invented_percent[index].toFixed(1);
-  const text = position + ", " + place(position) + "; " + invented + " % of the view seen by neither camera";
+function moveViewpoint(up = shownFrom.up) {
+  const position = Math.round(100 * slider.value) / 100;
+  showFrom(position, up);
+  const text = position + ", " + place(position);
   document.getElementById("where").textContent = text;
   slider.setAttribute("aria-valuetext", text);
 }
-slider.addEventListener("input", moveViewpoint);
+slider.addEventListener("input", () => moveViewpoint());
 moveViewpoint();
+startPhoto();
 
-// --- The wiggle: from one camera to the other and back, about the middle of the scene ---
+// --- The wiggle: from one camera to the other and back ---
 
 const TURN_MS = 1600;
 const play = document.getElementById("play");
 let wiggling = 0, startMs = 0;
 
-function showWiggle(position) {
-  const index = indexOf(position);
-  const moved = (positionOf(index) - 0.5) * data.middle_share;
-  showView(index);
-  // Enlarged so that no border of a moved view shows.
-  document.getElementById("views").style.transform = `scale(${1 + Math.abs(data.middle_share)}) translateX(${100 * moved}%)`;
-}
-
 function wiggle(nowMs) {
-  showWiggle(0.5 - 0.5 * Math.cos((2 * Math.PI * (nowMs - startMs)) / TURN_MS));
+  showFrom(0.5 - 0.5 * Math.cos((2 * Math.PI * (nowMs - startMs)) / TURN_MS), 0);
   wiggling = requestAnimationFrame(wiggle);
 }
 
@@ -73,52 +78,53 @@ function chooseMode(mode) {
   stage.dataset.mode = mode;
   for (const controls of document.querySelectorAll(".controls")) controls.hidden = controls.dataset.mode !== mode;
   setWiggling(false);
-  document.getElementById("views").style.transform = "";
   document.getElementById("anaglyph").classList.toggle("shown", mode === "anaglyph");
-  showScene(mode === "turn");
+  showMesh(mode === "turn");
   if (mode === "wiggle") {
-    showWiggle(0.5);
+    showFrom(0.5, 0);
     setWiggling(!still);
-  } else moveViewpoint();
+  } else if (mode === "slide") moveViewpoint(0);
 }
 for (const choice of document.querySelectorAll("[name=mode]")) {
   choice.addEventListener("change", () => chooseMode(choice.value));
 }
 
-// --- The 3-D view: see report_scene.js ---
+// --- The 3-D view: see mesh.js ---
 
-const canvas = document.getElementById("scene");
-let scene = null;
+const meshCanvas = document.getElementById("mesh");
+let mesh = null;
 
-async function showScene(on) {
-  canvas.hidden = !on;
-  scene?.stop();
+async function showMesh(on) {
+  meshCanvas.hidden = !on;
+  mesh?.stop();
   if (!on) return;
-  if (!scene) {
+  if (!mesh) {
     const picture = document.querySelector(".frame img");
     await Promise.all([unpacked, picture.decode()]);
-    scene = startScene(canvas, picture, maps);
-    if (!scene) document.getElementById("turning").textContent = "This browser has no WebGL 2, which the 3-D view needs.";
+    mesh = startMesh(meshCanvas, picture, maps);
+    if (!mesh) document.getElementById("turning").textContent = "This browser has no WebGL 2, which the 3-D view needs.";
   }
-  if (scene && !still && !canvas.hidden) scene.sway();
+  if (mesh && !still && !meshCanvas.hidden) mesh.sway();
 }
-for (const [id, use] of [["nearer", () => scene?.zoom(1 / 1.15)], ["farther", () => scene?.zoom(1.15)], ["again", () => scene?.reset()]]) {
+for (const [id, use] of [["nearer", () => mesh?.zoom(1 / 1.15)], ["farther", () => mesh?.zoom(1.15)], ["again", () => mesh?.reset()]]) {
   document.getElementById(id).addEventListener("click", use);
 }
 
-// Dragging the picture sideways moves the viewpoint.
+// Dragging the picture moves the viewpoint. A finger that moves up or down scrolls the page.
 stage.addEventListener("pointermove", (event) => {
   if (stage.dataset.mode !== "slide" || !stage.hasPointerCapture(event.pointerId)) return;
-  const share = Math.min(Math.max((event.clientX - stage.getBoundingClientRect().left) / stage.clientWidth, 0), 1);
+  const box = stage.getBoundingClientRect();
+  const share = Math.min(Math.max((event.clientX - box.left) / box.width, 0), 1);
   slider.value = Number(slider.min) + share * (slider.max - slider.min);
-  moveViewpoint();
+  const up = event.pointerType === "mouse" ? 1 - (2 * (event.clientY - box.top)) / box.height : 0;
+  moveViewpoint(data.photo.up * Math.min(Math.max(up, -1), 1));
 });
 stage.addEventListener("pointerdown", (event) => {
   if (stage.dataset.mode === "slide" && !event.target.closest("button")) stage.setPointerCapture(event.pointerId);
 });
 stage.addEventListener("dragstart", (event) => event.preventDefault());
 
-// --- The read-out: see pack_map in report_page.py ---
+// --- The read-out: see pack_map in report_parts.py ---
 
 let maps = null;
 
@@ -239,6 +245,6 @@ for (const picture of [stage, ...frames]) {
   picture.addEventListener("pointerdown", (event) => ([fromX, fromY] = [event.clientX, event.clientY]));
   picture.addEventListener("click", (event) => {
     // A drag is no click, and the 3-D view is dragged.
-    if (event.target !== canvas && Math.hypot(event.clientX - fromX, event.clientY - fromY) < 5) enlarge(picture, button);
+    if (event.target !== meshCanvas && Math.hypot(event.clientX - fromX, event.clientY - fromY) < 5) enlarge(picture, button);
   });
 }
