@@ -145,7 +145,7 @@ class ViewFile:
             threads=self.threads,
         )
         write_viewer(self.path, page)
-        return f"{VIEWER}, {len(page) / 1e6:.1f} MB; open it in a browser"
+        return f"{VIEWER}, {len(page) / 1e6:.2g} MB; open it in a browser"
 
 
 def _cut(frame: UInt8[np.ndarray, "h w 3"], part: tuple[slice, slice]) -> UInt8[np.ndarray, "h2 w2 3"]:

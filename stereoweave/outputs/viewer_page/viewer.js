@@ -120,8 +120,8 @@ async function makeViewer(canvas, scene, options = {}) {
     drawn = [u, v];
     view.draw(middle + reach * u, scene.up * v);
     // A slow graphics processor draws fewer pixels rather than fewer frames.
-    slow = passed_ms > SLOW_MS && passed_ms < 1000 ? slow + 1 : Math.max(0, slow - 1);
-    if (slow > 8 && sharpness > 0.4) {
+    slow = passed_ms > SLOW_MS ? slow + Math.min(passed_ms / SLOW_MS, 4) : Math.max(0, slow - 1);
+    if (slow > 12 && sharpness > 0.3) {
       sharpness *= 0.8;
       slow = 0;
     }
