@@ -121,7 +121,7 @@ def pack_map(
     )
     percent[unknown] = _NOT_SEEN
     planes = np.stack([(steps & 255).astype(np.uint8), (steps >> 8).astype(np.uint8), percent])
-    packed = zlib.compress(planes.tobytes(), 9)
+    packed = zlib.compress(planes.tobytes())
     height, width = disparity_px.shape
     return {
         "width": width,

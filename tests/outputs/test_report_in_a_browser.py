@@ -141,7 +141,18 @@ def test_without_webgl_the_slider_shows_the_nearest_of_five_views(page, step):
     assert near == pytest.approx(0, abs=0.5)
     assert far == pytest.approx(0.5 * SHIFT_PX, abs=1)
     choose(page, "3-D")
-    page.get_by_text("This browser has no WebGL 2").wait_for()
+    page.get_by_text("has no WebGL 2").wait_for()
+
+
+def test_a_browser_that_cannot_decompress_shows_all_but_the_read_out_and_the_3_d_view(page, report):
+    page.add_init_script("delete window.DecompressionStream")
+    page.goto(report.as_uri())
+    page.locator("#depth").hover()
+    assert page.locator(".reading").nth(1).text_content() == "Far is blue, near is red."
+    choose(page, "3-D")
+    page.get_by_text("This browser is too old for the 3-D view").wait_for()
+    choose(page, "Viewpoint")
+    assert page.locator("#photo").is_visible()
 
 
 def test_without_scripts_the_report_shows_the_middle_view_and_no_controls(browser, step):

@@ -101,8 +101,8 @@ async function showMesh(on) {
   if (!mesh) {
     const picture = document.querySelector(".frame img");
     await Promise.all([unpacked, picture.decode()]);
-    mesh = startMesh(meshCanvas, picture, maps);
-    if (!mesh) document.getElementById("turning").textContent = "This browser has no WebGL 2, which the 3-D view needs.";
+    mesh = maps && startMesh(meshCanvas, picture, maps);
+    if (!mesh) document.getElementById("turning").textContent = "This browser is too old for the 3-D view, or has no WebGL 2.";
   }
   if (mesh && !still && !meshCanvas.hidden) mesh.sway();
 }
@@ -129,6 +129,7 @@ stage.addEventListener("dragstart", (event) => event.preventDefault());
 let maps = null;
 
 async function unpackMaps() {
+  if (!window.DecompressionStream) return;
   const bytes = Uint8Array.from(atob(data.map.packed), (letter) => letter.charCodeAt(0));
   const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
   const planes = new Uint8Array(await new Response(stream).arrayBuffer());
