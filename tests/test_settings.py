@@ -33,11 +33,12 @@ SHARED = {"cameras", "matching", "outputs", "pictures", "rendering"}
 # Settings of these subpackages that the page and the service do not offer.
 ABSENT = {
     "page": {
-        *("convergence_px", "files", "forward", "layout", "left", "listed", "position", "provider"),
+        *("convergence_px", "crop", "files", "forward", "layout", "left", "listed", "position", "provider"),
         *("range_px", "raw", "refined", "right", "strength", "up"),
     },
     "service": {
-        *("convergence_px", "files", "forward", "layout", "left", "listed", "provider", "raw", "right", "up"),
+        *("convergence_px", "crop", "files", "forward", "layout", "left", "listed", "provider", "raw"),
+        *("right", "up"),
     },
 }
 

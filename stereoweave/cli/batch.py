@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from stereoweave.cli.commands import running_options
+from stereoweave.cli.commands import running_command, running_options
 from stereoweave.cli.options import (
     AsJson,
     BaselineM,
@@ -87,6 +87,7 @@ def batch(  # noqa: PLR0913 - each is an option of the command line
         options=MatchOptions(range_px=parse_range_px(range_px), refined=refined, raw=raw),
         files=tuple(write or ()),
         name_of=running_options(),
+        command=running_command(),
     )
     engine = Engine(address, workers, cpus_each, gpus_each)
     raise typer.Exit(run_cluster_command(source, destination, job, engine, as_json=as_json))

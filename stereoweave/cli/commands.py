@@ -1,5 +1,6 @@
-"""Names of the running command's options, used for settings in error messages and notes."""
+"""The running command: its words, and the names of its options for settings in error messages and notes."""
 
+import shlex
 from collections.abc import Callable
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -45,7 +46,16 @@ def option_names(command: TyperCommand) -> OptionNames:
     return OptionNames(names | negations)
 
 
+_WORDS = "stereoweave.words"
 _running: ContextVar[NameOf] = ContextVar("names of the running command's options", default=keyword)
+
+
+_words: ContextVar[str] = ContextVar("the running command as typed", default="")
+
+
+def running_command() -> str:
+    """Return the running command as typed in a shell; "" if no command is running."""
+    return _words.get()
 
 
 def running_options() -> NameOf:
@@ -56,16 +66,22 @@ def running_options() -> NameOf:
 class Command(TyperCommand):
     """A command whose error messages refer to settings by the names of its options."""
 
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse the command's arguments, and keep them as they were typed."""
+        ctx.meta[_WORDS] = shlex.join([*ctx.command_path.split(), *args])
+        return super().parse_args(ctx, args)
+
     def invoke(self, ctx: Any) -> Any:
         """Run the command. Error messages refer to settings by the names of its options."""
         names = option_names(self)
-        token = _running.set(names)
+        token, words = _running.set(names), _words.set(ctx.meta[_WORDS])
         try:
             return super().invoke(ctx)
         except StereoweaveError as error:
             raise StereoweaveError(error.format(names)) from error
         finally:
             _running.reset(token)
+            _words.reset(words)
 
 
 class Commands(typer.Typer):

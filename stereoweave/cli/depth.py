@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stereoweave.cli.commands import running_options
+from stereoweave.cli.commands import running_command, running_options
 from stereoweave.cli.options import (
     AsJson,
     BaselineM,
@@ -100,6 +100,7 @@ def depth(  # noqa: PLR0913 - each is an option of the command line
         options=MatchOptions(range_px=parse_range_px(range_px), refined=refined, raw=raw),
         files=tuple(write or ()),
         name_of=running_options(),
+        command=running_command(),
     )
     pictures = pictures or []
     if found := find_pairs(pictures, left, right, listed):

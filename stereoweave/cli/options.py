@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from stereoweave.pictures.prepare import Request
     from stereoweave.system.ray_engine import Engine
 
+_LEAST_SIDE_PX = 32
+
 Pictures = Annotated[
     list[Path],
     typer.Argument(
@@ -192,6 +194,20 @@ def parse_size_px(size: str) -> tuple[int, int]:
     if found is None:
         raise StereoweaveError(f"--size: expected width x height in pixels, such as 640x480, found {size!r}")
     return int(found[1]), int(found[2])
+
+
+def parse_largest_size_px(size: str | None) -> tuple[int, int] | None:
+    """Parse --size into the largest width and height in px; None if it is not given."""
+    if size is None:
+        return None
+    found = re.fullmatch("([0-9]{1,9})(?:x([0-9]{1,9}))?", size)
+    sides = (int(found[1]), int(found[2] or found[1])) if found else (0, 0)
+    if min(sides) < _LEAST_SIDE_PX:
+        raise StereoweaveError(
+            "--size: expected the longer side in pixels, or width x height, such as 1600 or 1600x1200, at "
+            f"least {_LEAST_SIDE_PX} px per side, found {size!r}"
+        )
+    return sides
 
 
 def make_parent_folder(*files: Path) -> Path:

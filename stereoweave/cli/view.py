@@ -19,14 +19,13 @@ from stereoweave.cli.options import (
     Threads,
     make_parent_folder,
     make_request,
+    parse_largest_size_px,
     parse_range_px,
 )
 from stereoweave.errors import StereoweaveError
 
 if TYPE_CHECKING:
     from stereoweave.rendering.layouts import LayoutOptions
-    from stereoweave.rendering.renderer import Renderer
-    from stereoweave.stereo import View
 
 _MIDDLE = 0.5
 
@@ -37,7 +36,8 @@ Out = Annotated[
         "--out",
         "-o",
         help="File to write. Viewers recognise some layouts by a mark in the file name, which is added "
-        "automatically: view.png becomes view_qs8x6a0.75.png for a quilt. .mpo and .jps are 3-D pictures.",
+        "automatically: view.png becomes view_qs8x6a0.75.png for a quilt. .mpo and .jps are 3-D pictures, "
+        ".html is a 3-D page (--layout viewer).",
     ),
 ]
 Position = Annotated[
@@ -56,7 +56,8 @@ Layout = Annotated[
     typer.Option(
         help="Layout of several views in one picture: side_by_side, side_by_side_half, crossed, top_bottom, "
         "top_bottom_half, anaglyph_grey, anaglyph_colour, anaglyph_half_colour, anaglyph_dubois, rgbd, "
-        "quilt or contact_sheet; or an animation, sweep or wiggle, as .mp4 (extra 'video'), .gif or .webp."
+        "quilt or contact_sheet; an animation, sweep or wiggle, as .mp4 (extra 'video'), .gif or .webp; or "
+        "viewer, a page for any browser (.html) in which the mouse or a finger moves the viewpoint."
     ),
 ]
 Convergence = Annotated[
@@ -64,12 +65,28 @@ Convergence = Annotated[
     typer.Option(
         metavar="PX|auto",
         help="Disparity that stays in place in all views; auto is the scene's median disparity (default: "
-        "auto for anaglyphs, quilts, contact sheets and animations, 0 for all others).",
+        "auto for anaglyphs, quilts, contact sheets, animations and the viewer, 0 for all others).",
     ),
 ]
 Quilt = Annotated[
     str | None,
     typer.Option(metavar="COLUMNSxROWS", help="Columns and rows of views in a quilt (default: 8x6)."),
+]
+Size = Annotated[
+    str | None,
+    typer.Option(
+        metavar="PX|WIDTHxHEIGHT",
+        help="Longer side, or largest width and height, of each view: larger pictures are scaled down after "
+        "matching (default: the pictures' size; 1600, the most, for the viewer).",
+    ),
+]
+Crop = Annotated[
+    str | None,
+    typer.Option(
+        metavar="auto",
+        help="auto cuts off the borders that not every view of the picture really shows, and that are "
+        "invented otherwise: of a single view, an anaglyph or an animation.",
+    ),
 ]
 Calib = Annotated[
     Path | None,
@@ -87,6 +104,8 @@ def view(  # noqa: PLR0913 - each is an option of the command line
     strength: Strength = 1.0,
     convergence: Convergence = None,
     quilt: Quilt = None,
+    size: Size = None,
+    crop: Crop = None,
     format: Format = None,
     calib: Calib = None,
     rectify: Rectify = None,
@@ -100,38 +119,38 @@ def view(  # noqa: PLR0913 - each is an option of the command line
     Layouts are for 3-D viewers and displays.
     """
     from stereoweave.cameras.diagnosis import find_problems
-    from stereoweave.cameras.rectify import crop
+    from stereoweave.cameras.rectify import crop as crop_to_content
     from stereoweave.matching.backend import Backend
     from stereoweave.matching.estimate import match
     from stereoweave.matching.options import MatchOptions
+    from stereoweave.outputs.view_files import ViewFile
     from stereoweave.pictures.prepare import prepare
-    from stereoweave.rendering import layouts
-    from stereoweave.rendering.renderer import Renderer, check_position
+    from stereoweave.rendering.layouts import choose_layout
 
-    name = layouts.choose_layout(out, layout)
+    name = choose_layout(out, layout)
     _check_unused(name, {"--position": position, "--up": up or None, "--forward": forward or None}, quilt)
     if strength != 1 or convergence is not None:
         _check_has_views(name)
-    check_position(_MIDDLE, up=up, forward=forward)
-    layout_options = _parse_quilt(quilt)
-    positions, converged = _view_positions(name, _MIDDLE if position is None else position)
-    layouts.check_positions(positions, strength)
-    plane_px = _parse_convergence_px(("auto" if converged else "0") if convergence is None else convergence)
+    file = ViewFile(
+        path=out,
+        name=name,
+        position=_MIDDLE if position is None else position,
+        up=up,
+        forward=forward,
+        strength=strength,
+        convergence_px=_parse_convergence_px(convergence or _default_convergence(name)),
+        layout_options=_parse_quilt(quilt),
+        size_px=parse_largest_size_px(size),
+        crops=_parse_crop(crop),
+        threads=threads,
+    )
     options = MatchOptions(range_px=parse_range_px(range_px), refined=True)
     prepared = prepare(pictures, make_request(format, calib, rectify=rectify))
-    pair = crop(prepared.pair)
-    if name in layouts.LAYOUTS:
-        out = layouts.add_mark(out, name, pair, layout_options)
-    make_parent_folder(out)
+    pair = crop_to_content(prepared.pair)
+    file = file.add_mark(pair)
+    make_parent_folder(file.path)
     estimate = match(Backend(model=model, threads=threads, provider=provider).matcher(), pair, options)
-    if plane_px is None:
-        plane_px = layouts.median_disparity_px(estimate)
-    renderer = Renderer(pair, estimate, strength=strength, convergence_px=plane_px, threads=threads)
-    if name is None:
-        written = _write_view(out, renderer.view(*positions, up=up, forward=forward), *positions)
-    else:
-        written = _write_layout(out, name, renderer, layout_options)
-    typer.echo(f"{out}: {written}")
+    typer.echo(f"{file.path}: {file.write(pair, estimate, prepared.pictures)}")
     for note in (*prepared.notes, *find_problems(pair, estimate, prepared.alignment)):
         typer.echo(note.format(running_options()))
 
@@ -169,14 +188,18 @@ def _parse_quilt(quilt: str | None) -> "LayoutOptions":
     return LayoutOptions(columns=int(match[1]), rows=int(match[2]))
 
 
-def _view_positions(name: str | None, position: float) -> tuple[tuple[float, ...], bool]:
-    """Return the positions of the views, and whether --convergence is auto by default."""
-    from stereoweave.rendering.layouts import ANIMATIONS, LAYOUTS
+def _default_convergence(name: str | None) -> str:
+    """Return the --convergence of a layout for which none is given."""
+    from stereoweave.rendering.layouts import LAYOUTS
 
-    if name is None:
-        return (position,), False
-    shown = LAYOUTS[name] if name in LAYOUTS else ANIMATIONS[name]
-    return shown.positions, shown.converged
+    parallel = name is None or (name in LAYOUTS and not LAYOUTS[name].converged)
+    return "0" if parallel else "auto"
+
+
+def _parse_crop(crop: str | None) -> bool:
+    if crop not in (None, "auto"):
+        raise StereoweaveError(f"--crop: expected auto, found {crop!r}")
+    return crop is not None
 
 
 def _parse_convergence_px(convergence: str) -> float | None:
@@ -190,27 +213,3 @@ def _parse_convergence_px(convergence: str) -> float | None:
     if not math.isfinite(plane_px):
         raise StereoweaveError(f"--convergence: expected a disparity in px, or auto, found {convergence!r}")
     return plane_px
-
-
-def _write_view(out: Path, view: "View", position: float) -> str:
-    """Write one view, and return a description of it for the user."""
-    from stereoweave.io.images import write_image
-
-    write_image(out, view.image)
-    return f"view at {position:g}, {100 * (~view.drawn).mean():.1f} % of it seen by neither camera"
-
-
-def _write_layout(out: Path, name: str, renderer: "Renderer", layout_options: "LayoutOptions") -> str:
-    """Write several views in a layout, and return a description of the file for the user."""
-    from stereoweave.io.animation import write_animation
-    from stereoweave.rendering.layouts import ANIMATIONS, LAYOUTS, render_views, write_picture
-
-    if name in LAYOUTS:
-        picture = LAYOUTS[name].compose(renderer, layout_options)
-        write_picture(out, picture)
-        return f"{name}, {picture.shape[1]}x{picture.shape[0]} px"
-    motion = ANIMATIONS[name]
-    turns = motion.turns(out)
-    write_animation(out, render_views(renderer, motion.positions * turns), motion.frame_ms)
-    count = len(motion.positions) * turns
-    return f"{name}, {count} frames in {count * motion.frame_ms / 1000:g} s"

@@ -1,17 +1,16 @@
 """Self-contained HTML report on a result: images, a summary, and new views with a slider."""
 
-import base64
 import html
-import importlib.resources
 import json
-import string
 from dataclasses import asdict, dataclass
+from datetime import datetime
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
 
+from stereoweave import __version__
 from stereoweave.io.colormap import (
     OCCLUDED_RGB,
     colour_confidence,
@@ -21,14 +20,32 @@ from stereoweave.io.colormap import (
     legend_colours,
 )
 from stereoweave.io.text import writing_text
+from stereoweave.outputs.report_parts import (
+    download_list,
+    fill_template,
+    jpeg_uri,
+    list_box,
+    pack_map,
+    term_list,
+    view_tags,
+)
+from stereoweave.outputs.viewer_scene import pack_scene
+from stereoweave.rendering.layouts import LAYOUTS, LayoutOptions, median_disparity_px, render_views
 from stereoweave.rendering.renderer import Renderer
 from stereoweave.stereo import Estimate, StereoCamera, StereoPair
 
-POSITIONS = tuple(step / 8 for step in range(-2, 11))
+# Views for browsers without WebGL; others show the view from any position.
+POSITIONS = (0.0, 0.25, 0.5, 0.75, 1.0)
 
 _LONGER_SIDE_PX = 1000
-_LONGER_SIDE_OF_MAP_PX = 400
-_JPEG_QUALITY = 88
+_LONGER_SIDE_OF_MAP_PX = 640
+# The 3-D view shows what is farther than this multiple of the distance about which it turns there.
+_FARTHEST = 4.0
+_LEAST_MIDDLE_PX = 1.0
+# Largest difference of disparity, per pixel, on one surface of the 3-D view; a larger one is an edge.
+_STEEPEST = 1.0
+# Beyond it, the disparity says no more than "far".
+_FAR_M = 10_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,7 +86,7 @@ def summarize(
         estimate_ms: Duration of matching.
     """
     height_px, width_px = estimate.disparity_px.shape
-    seen = slice(None) if pair.left_seen is None else pair.left_seen
+    seen = _seen(pair)
     low_px, median_px, high_px = np.percentile(estimate.disparity_px[seen], [0, 50, 100])
     return Summary(
         pictures=pictures,
@@ -89,66 +106,113 @@ def summarize(
     )
 
 
-def write_report(
-    path: Path, pair: StereoPair, estimate: Estimate, summary: Summary, threads: int | None = None
-) -> None:
-    """Write the report as a single HTML file without external resources.
+@dataclass(frozen=True, kw_only=True)
+class Context:
+    """What a report needs besides the result itself.
 
-    The report shows the left image, the depth (or the disparity if the camera is unknown), the confidence,
-    the summary, and the views from POSITIONS with a slider to move the viewpoint. Images have at most 1000 px
-    on the longer side. `threads` is the number of threads for rendering.
+    Attributes:
+        warnings: Lines about likely defects of the pair or the result.
+        notes: Lines on what was detected or changed while the pictures were read.
+        command: The command that made the result, as typed; "" if there was none.
+        date: When the pair was matched.
+        files: The result's other files, which lie in the report's folder.
+        threads: Number of threads for rendering; default: all cores.
     """
-    source = importlib.resources.files("stereoweave.outputs") / "report.html"
-    template = source.read_text(encoding="utf-8")
-    page = string.Template(template).substitute(_collect_fields(pair, estimate, summary, threads))
+
+    warnings: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    command: str = ""
+    date: datetime | None = None
+    files: tuple[Path, ...] = ()
+    threads: int | None = None
+
+
+def write_report(
+    path: Path, pair: StereoPair, estimate: Estimate, summary: Summary, context: Context
+) -> None:
+    """Write the report as a single HTML file, which loads no other file.
+
+    The report shows the warnings, new views with a slider to move the viewpoint, a wiggle, an anaglyph, the
+    left image in 3-D and plain, the depth (or the disparity if the camera is unknown), the confidence, the
+    summary, and how the result was made. It links to the context's files. Images have at most 1000 px on the
+    longer side.
+    """
+    page = fill_template(_collect_fields(pair, estimate, summary, context))
     with writing_text(path) as file:
         file.write(page)
 
 
 def _collect_fields(
-    pair: StereoPair, estimate: Estimate, summary: Summary, threads: int | None
+    pair: StereoPair, estimate: Estimate, summary: Summary, context: Context
 ) -> dict[str, object]:
     """Return the values of the template's fields by name."""
     small, small_estimate = downscale(pair, estimate, _LONGER_SIDE_PX)
-    renderer = Renderer(small, small_estimate, threads=threads)
-    views = [renderer.view(position) for position in POSITIONS]
-    seen = slice(None) if pair.left_seen is None else pair.left_seen
-    range_px = find_colour_range_px(np.atleast_2d(estimate.disparity_px[seen]))
     height, width = small.left.shape[:2]
+    range_px = find_colour_range_px(np.atleast_2d(estimate.disparity_px[_seen(pair)]))
     depth = colour_disparity(_resize_nearest(estimate.disparity_px, (width, height)), range_px)
     if small.left_seen is not None:
         depth[~small.left_seen] = 0
+    views = _show_views(small, small_estimate, context.threads)
     data = {
         "width_px": summary.width_px,
         "height_px": summary.height_px,
         "camera": asdict(pair.camera) if pair.camera else None,
-        "invented_percent": [round(100 * float((~view.drawn).mean()), 2) for view in views],
-        "map": _encode_disparity(estimate),
+        "map": pack_map(*_downscale_map(pair, estimate)),
+        "scene": _place_scene(pair, estimate),
+        **views.data,
     }
-    title = " + ".join(summary.pictures)
     size = f"{summary.width_px} × {summary.height_px} px"
     return {
-        "title": html.escape(title),
-        "subtitle": html.escape(f"{size}, matched by {summary.model} in {summary.estimate_ms:.0f} ms"),
+        "title": html.escape(" + ".join(summary.pictures)),
+        "subtitle": html.escape(f"{size}, matched by {summary.model} in {_format_time(summary)}"),
+        "banner": list_box("banner", "Warnings", context.warnings),
+        "notes": list_box("card notes", "Notes", context.notes),
         "width": width,
         "height": height,
-        "views": "\n".join(map(_view_tag, POSITIONS, (view.image for view in views))),
-        "first": POSITIONS[0],
-        "last": POSITIONS[-1],
-        "step": POSITIONS[1] - POSITIONS[0],
-        "left_end": _along_slider(0),
-        "right_end": _along_slider(1),
-        "numbers": "\n".join(_number_tag(name, value) for name, value in _list_numbers(summary)),
-        "left": _data_uri(small.left),
+        **views.fields,
+        "numbers": term_list(_list_numbers(summary)),
         "depth_name": "Depth" if pair.camera else "Disparity",
-        "depth": _data_uri(depth),
-        "confidence": _data_uri(colour_confidence(small_estimate.confidence, small_estimate.occluded)),
+        "depth": jpeg_uri(depth),
+        "confidence": jpeg_uri(colour_confidence(small_estimate.confidence, small_estimate.occluded)),
         "ramp": ",".join(legend_colours(24)),
         "ticks": "".join(f"<span>{tick}</span>" for tick in _label_ticks(range_px, pair.camera)),
         "occluded_colour": css_colour(OCCLUDED_RGB),
+        "downloads": download_list(context.files),
+        "command": term_list([("Command", context.command)], kind="long") if context.command else "",
+        "making": term_list(_list_making(context)),
         # "</" would end the script element that contains the data.
         "data": json.dumps(data).replace("</", "<\\/"),
     }
+
+
+class _Views(NamedTuple):
+    """Fields of the template, and data for its script, that show the new views."""
+
+    fields: dict[str, object]
+    data: dict[str, object]
+
+
+def _show_views(pair: StereoPair, estimate: Estimate, threads: int | None) -> _Views:
+    """Prepare the new views and the anaglyph of a pair that is small enough to display."""
+    width = pair.left.shape[1]
+    # A matcher file may give more, which no view can be moved by.
+    middle_px = float(np.clip(median_disparity_px(estimate), -width, width))
+    renderer = Renderer(pair, estimate, convergence_px=middle_px, threads=threads)
+    photo = pack_scene(pair, estimate, convergence_px=middle_px, threads=threads)
+    first, last = photo["positions"]
+    left_end, right_end = (f"{100 * (position - first) / (last - first):.2f}%" for position in (0, 1))
+    return _Views(
+        fields={
+            "views": view_tags(POSITIONS, list(render_views(renderer, POSITIONS))),
+            "first": first,
+            "last": last,
+            "left_end": left_end,
+            "right_end": right_end,
+            "left": photo.pop("front"),
+            "anaglyph": jpeg_uri(LAYOUTS["anaglyph_dubois"].compose(renderer, LayoutOptions())),
+        },
+        data={"photo": photo, "positions": POSITIONS},
+    )
 
 
 def downscale(pair: StereoPair, estimate: Estimate, longer_side_px: int) -> tuple[StereoPair, Estimate]:
@@ -178,24 +242,54 @@ def _resize_nearest(values: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     return cv2.resize(numbers, size, interpolation=cv2.INTER_NEAREST_EXACT).view(values.dtype)
 
 
-def _encode_disparity(estimate: Estimate) -> dict[str, object]:
-    """Encode the disparities that are shown beside the mouse pointer, as low_px + step_px * level.
+def _downscale_map(pair: StereoPair, estimate: Estimate) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return disparity, confidence and occlusion for the read-out; the disparity stays in px of the pair.
 
-    The levels have 16 bits and are encoded in base64.
+    The confidence is NaN outside the left image's content.
     """
     height, width = estimate.disparity_px.shape
     scale = min(1.0, _LONGER_SIDE_OF_MAP_PX / max(height, width))
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
-    picked_px = _resize_nearest(estimate.disparity_px, size)
-    low_px = float(picked_px.min())
-    step_px = max(float(picked_px.max()) - low_px, 1e-6) / 65535
-    levels = np.round((picked_px - low_px) / step_px).astype("<u2")
+    confidence = estimate.confidence
+    if pair.left_seen is not None:
+        confidence = np.where(pair.left_seen, confidence, np.float32(np.nan))
+    return (
+        _resize_nearest(estimate.disparity_px, size),
+        _resize_nearest(confidence, size),
+        _resize_nearest(estimate.occluded, size),
+    )
+
+
+def _place_scene(pair: StereoPair, estimate: Estimate) -> dict[str, float]:
+    """Return the camera of the 3-D view, in px of the pair and in baselines.
+
+    The view turns about the distance `middle`, that of the disparity halfway between the least and the
+    greatest one, outliers aside. What is farther than `farthest` is shown there. Without a camera, or with
+    one for which the middle is infinitely far, one with a field of view of 53 degrees is assumed, and the
+    least disparity is taken to be at infinity.
+    """
+    least_px, greatest_px = np.percentile(estimate.disparity_px[_seen(pair)], [1, 99]).tolist()
+    halfway_px = (least_px + greatest_px) / 2
+    height, width = estimate.disparity_px.shape
+    camera = pair.camera
+    if camera is None or halfway_px + camera.doffs_px < _LEAST_MIDDLE_PX:
+        camera = StereoCamera(
+            focal_px=width,
+            baseline_m=1,
+            cx_px=(width - 1) / 2,
+            cy_px=(height - 1) / 2,
+            doffs_px=max(0.0, -least_px, _LEAST_MIDDLE_PX - halfway_px),
+        )
+    middle_px = halfway_px + camera.doffs_px
     return {
-        "width": size[0],
-        "height": size[1],
-        "low_px": low_px,
-        "step_px": step_px,
-        "levels": base64.b64encode(levels.tobytes()).decode(),
+        "focal_px": camera.focal_px,
+        "cx_px": camera.cx_px,
+        "cy_px": camera.cy_px,
+        "doffs_px": camera.doffs_px,
+        "least_px": middle_px / _FARTHEST,
+        "steepest_px": _STEEPEST * max(1.0, max(height, width) / _LONGER_SIDE_OF_MAP_PX),
+        "middle": camera.focal_px / middle_px,
+        "farthest": _FARTHEST * camera.focal_px / middle_px,
     }
 
 
@@ -204,7 +298,7 @@ def _list_numbers(summary: Summary) -> list[tuple[str, str]]:
     rows = [
         ("Size", f"{summary.width_px} × {summary.height_px} px"),
         ("Model", summary.model),
-        ("Time", f"{summary.estimate_ms:.0f} ms"),
+        ("Time", _format_time(summary)),
         ("Disparity", f"{summary.disparity_min_px:.1f} to {summary.disparity_max_px:.1f} px"),
         ("Median disparity", f"{summary.disparity_median_px:.1f} px"),
     ]
@@ -222,6 +316,17 @@ def _list_numbers(summary: Summary) -> list[tuple[str, str]]:
         ("Confident (at least 50 %)", f"{summary.confident_percent:.1f} %"),
         ("Occluded", f"{summary.occluded_percent:.1f} %"),
     ]
+
+
+def _list_making(context: Context) -> list[tuple[str, str]]:
+    """Return how the result was made, besides the command: names and values."""
+    date = [("Date", f"{context.date:%Y-%m-%d %H:%M %Z}")] if context.date else []
+    return [("Version", f"Stereoweave {__version__}"), *date]
+
+
+def _seen(pair: StereoPair) -> Any:
+    """Return an index of the pixels that the left image covers."""
+    return np.s_[:] if pair.left_seen is None else pair.left_seen
 
 
 def _label_ticks(range_px: tuple[float, float], camera: StereoCamera | None) -> list[str]:
@@ -246,31 +351,15 @@ def _depth_m(camera: StereoCamera | None, disparity_px: float) -> float | None:
 def _format_metres(depth_m: float | None) -> str:
     if depth_m is None:
         return "∞"
+    if depth_m >= _FAR_M:
+        return "> 10 km"
     return f"{depth_m:#.3g} m" if depth_m < 99.95 else f"{depth_m:.0f} m"
+
+
+def _format_time(summary: Summary) -> str:
+    time_ms = summary.estimate_ms
+    return f"{time_ms:.0f} ms" if time_ms < 999.5 else f"{time_ms / 1000:.1f} s"
 
 
 def _round(value: float) -> float:
     return round(float(value), 4)
-
-
-def _along_slider(position: float) -> str:
-    return f"{100 * (position - POSITIONS[0]) / (POSITIONS[-1] - POSITIONS[0]):.2f}%"
-
-
-def _number_tag(name: str, value: str) -> str:
-    return f"<div><dt>{html.escape(name)}</dt><dd>{html.escape(value)}</dd></div>"
-
-
-def _view_tag(position: float, image: UInt8[np.ndarray, "h w 3"]) -> str:
-    # The middle view is visible even with scripts disabled.
-    shown = ' class="shown"' if position == 0.5 else ""
-    return f'<img{shown} src="{_data_uri(image)}" alt="View at position {position}">'
-
-
-def _data_uri(image: UInt8[np.ndarray, "h w 3"]) -> str:
-    """Encode an image as a JPEG data URI."""
-    encoded, jpeg = cv2.imencode(
-        ".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
-    )
-    assert encoded
-    return "data:image/jpeg;base64," + base64.b64encode(jpeg.tobytes()).decode()

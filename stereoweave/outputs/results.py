@@ -40,7 +40,8 @@ from stereoweave.outputs.point_cloud import (
     write_glb,
     write_ply,
 )
-from stereoweave.outputs.report import Summary, write_report
+from stereoweave.outputs.report import Context, Summary, write_report
+from stereoweave.outputs.report_parts import CONTENTS
 from stereoweave.outputs.run import Result, run
 from stereoweave.pictures.prepare import Request, prepare
 from stereoweave.stereo import StereoPair
@@ -52,7 +53,19 @@ def _write_preview(path: Path, result: Result) -> None:
     write_image(path, colour_disparity(disparity_px, range_px) * result.seen[..., None])
 
 
-# All output files of `depth`.
+def _write_report(path: Path, result: Result) -> None:
+    context = Context(
+        warnings=tuple(note.format(result.name_of) for note in result.warnings()),
+        notes=tuple(note.format(result.name_of) for note in result.notes),
+        command=result.command,
+        date=result.date,
+        files=tuple(file for file in map(path.with_name, CONTENTS) if file.exists()),
+        threads=result.threads,
+    )
+    write_report(path, result.pair, result.estimate, result.summary, context)
+
+
+# All output files of `depth`; the report is last, because it lists the others.
 FILES: dict[str, Callable[[Path, Result], None]] = {
     "disparity.pfm": lambda path, result: write_pfm(path, result.disparity_px(np.inf)),
     "disparity.png": lambda path, result: write_disparity_png(path, result.disparity_px()),
@@ -69,9 +82,7 @@ FILES: dict[str, Callable[[Path, Result], None]] = {
     "cloud.glb": lambda path, result: write_glb(path, result.point_cloud),
     "mesh.ply": lambda path, result: write_ply(path, result.mesh),
     "mesh.glb": lambda path, result: write_glb(path, result.mesh),
-    "report.html": lambda path, result: write_report(
-        path, result.pair, result.estimate, result.summary, result.threads
-    ),
+    "report.html": _write_report,
 }
 ALWAYS = ("disparity.pfm", "disparity.png", "preview.png", "confidence.png", "occluded.png", "report.html")
 ALL = "all"
@@ -89,6 +100,7 @@ class DepthJob:
             known.
         always: Output files written for every pair.
         name_of: The front end's names for settings, for the notes and errors that a batch records.
+        command: The command as typed, for the reports.
     """
 
     request: Request = Request()
@@ -97,6 +109,7 @@ class DepthJob:
     files: tuple[str, ...] = ()
     always: tuple[str, ...] = ALWAYS
     name_of: NameOf = keyword
+    command: str = ""
 
     def __post_init__(self) -> None:
         for file in self.files:
@@ -113,6 +126,7 @@ def make_depth(pictures: Sequence[Path], out: Path, job: DepthJob) -> tuple[Summ
     files, left_out = _choose_files(job, prepared.pair)
     with _write_together(out) as folder:
         result = run(prepared, matcher, job.options)
+        result = replace(result, command=job.command, name_of=job.name_of)
         notes = [*result.notes, *left_out, *write_files(folder, files, result), *result.warnings()]
     return result.summary, notes
 

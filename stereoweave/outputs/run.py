@@ -3,6 +3,7 @@
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from functools import cached_property
 
 import numpy as np
@@ -10,7 +11,7 @@ from jaxtyping import Bool, Float, Float32
 
 from stereoweave.cameras.alignment import Alignment
 from stereoweave.cameras.diagnosis import find_problems
-from stereoweave.errors import Note
+from stereoweave.errors import NameOf, Note, keyword
 from stereoweave.matching.estimate import match_many
 from stereoweave.matching.matcher import Matcher
 from stereoweave.matching.options import MatchOptions
@@ -32,6 +33,9 @@ class Result:
         notes: Notes on what was detected or changed while the pictures were read.
         threads: Number of threads for rendering; default: all cores.
         alignment: The alignment of the pair, if it has been measured.
+        date: When the pair was matched.
+        command: The command that asked for the result, as typed; "" if there was none.
+        name_of: The front end's names for settings, for the notes in the report.
     """
 
     pair: StereoPair
@@ -40,6 +44,9 @@ class Result:
     notes: tuple[Note, ...] = ()
     threads: int | None = None
     alignment: Alignment | None = None
+    date: datetime | None = None
+    command: str = ""
+    name_of: NameOf = keyword
 
     @property
     def seen(self) -> Bool[np.ndarray, "h w"]:
@@ -59,9 +66,13 @@ class Result:
     def warnings(self) -> list[Note]:
         """Return notes on likely defects of the pair.
 
-        This takes about half as long as matching, unless the alignment is known.
+        The first call takes about half as long as matching, unless the alignment is known.
         """
-        return find_problems(self.pair, self.estimate, self.alignment)
+        return list(self._problems)
+
+    @cached_property
+    def _problems(self) -> tuple[Note, ...]:
+        return tuple(find_problems(self.pair, self.estimate, self.alignment))
 
     @cached_property
     def point_cloud(self) -> PointCloud:
@@ -83,6 +94,7 @@ def run_many(prepared: Sequence[Prepared], matcher: Matcher, options: MatchOptio
     start_s = time.perf_counter()
     estimates = match_many(matcher, [each.pair for each in prepared], options)
     total_ms = 1000 * (time.perf_counter() - start_s)
+    date = datetime.now(UTC)
     model = matcher.model if matcher.provider == CPU else f"{matcher.model} on {matcher.provider}"
     return [
         Result(
@@ -98,6 +110,7 @@ def run_many(prepared: Sequence[Prepared], matcher: Matcher, options: MatchOptio
             notes=each.notes,
             threads=matcher.threads,
             alignment=each.alignment,
+            date=date,
         )
         for each, estimate in zip(prepared, estimates, strict=True)
     ]

@@ -232,8 +232,10 @@ ANIMATIONS: dict[str, Animation] = {
     "sweep": Animation(positions=_swing_positions(80), frame_ms=40, mp4_turns=1),
     "wiggle": Animation(positions=_swing_positions(12), frame_ms=60, mp4_turns=5),
 }
+VIEWER = "viewer"
+"""The layout of a page that shows the scene in 3-D (`outputs/viewer.py`)."""
 # Layouts that are determined by the file extension.
-_LAYOUT_BY_ENDING = {".mpo": "side_by_side", ".jps": "crossed"}
+_LAYOUT_BY_ENDING = {".mpo": "side_by_side", ".jps": "crossed", ".html": VIEWER}
 # No chroma subsampling, because stereo pictures are magnified and compared by both eyes.
 _FINE = {"quality": 95, "subsampling": 0}
 # The JPEG marker APP3, the segment's length, the identifier, the length of the next four bytes, these four
@@ -248,9 +250,9 @@ def choose_layout(path: str | Path, name: str | None) -> str | None:
     Raises:
         StereoweaveError: The layout is unknown or does not match the file extension.
     """
-    if name is not None and name not in LAYOUTS | ANIMATIONS:
+    if name not in (None, *LAYOUTS, *ANIMATIONS, VIEWER):
         raise StereoweaveError(
-            f"expected one of {', '.join([*LAYOUTS, *ANIMATIONS])}, found {name!r}", setting="layout"
+            f"expected one of {', '.join([*LAYOUTS, *ANIMATIONS, VIEWER])}, found {name!r}", setting="layout"
         )
     ending = Path(path).suffix.lower()
     held = _LAYOUT_BY_ENDING.get(ending)
@@ -258,6 +260,10 @@ def choose_layout(path: str | Path, name: str | None) -> str | None:
         if name not in (None, held):
             raise StereoweaveError(f"{path}: expected the layout {held} for this extension, found {name}")
         return held
+    if name == VIEWER:
+        raise StereoweaveError(
+            f"{path}: expected the file extension .html for the layout viewer, found {Path(path).suffix!r}"
+        )
     if name in ANIMATIONS:
         check_animation_ending(path)
     else:

@@ -333,7 +333,9 @@ def test_the_command_takes_a_list_and_writes_reports_only_on_request(tmp_path, c
     assert (out / "quay" / "disparity.pfm").exists()
     assert not (out / "quay" / "report.html").exists()
     assert main([*words, str(tmp_path / "reports"), "--write", "report.html"]) == 1
-    assert (tmp_path / "reports" / "quay" / "report.html").exists()
+    report = (tmp_path / "reports" / "quay" / "report.html").read_text(encoding="utf-8")
+    assert "stereoweave depth --list" in report
+    assert 'href="disparity.pfm"' in report
     assert main([*words, str(out), "--left", "*.png"]) == 2
     assert "found patterns and a list; give exactly one of them (--left, --right, --list)" in (
         capsys.readouterr().err

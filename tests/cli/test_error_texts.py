@@ -7,7 +7,7 @@ from error_examples import LAYOUTS, write_error_examples
 
 from stereoweave.cli.root import main
 from stereoweave.outputs.results import FILES
-from stereoweave.rendering.layouts import ANIMATIONS
+from stereoweave.rendering.layouts import ANIMATIONS, VIEWER
 from stereoweave.rendering.layouts import LAYOUTS as VIEW_LAYOUTS
 
 PAIR = "left.png right.png"
@@ -59,7 +59,7 @@ ERRORS = {
         "--position: expected -1 to 2 (0 is the left camera and 1 the right one), got 3"
     ),
     f"view {PAIR} --layout diagonal -o out.png": "--layout: expected one of "
-    f"{', '.join([*VIEW_LAYOUTS, *ANIMATIONS])}, found 'diagonal'",
+    f"{', '.join([*VIEW_LAYOUTS, *ANIMATIONS, VIEWER])}, found 'diagonal'",
     "video plain.png -o out.mp4": "expected one kind of output, found none; choose one (--depth, "
     "--depth16, --position, --layout)",
     "video plain.png --depth -o out.mp4": "plain.png: expected a 3-D video, two views side by side or one "

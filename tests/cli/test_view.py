@@ -1,5 +1,6 @@
 """The command `stereoweave view` with layouts: its files, messages and errors."""
 
+import json
 import re
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from PIL import Image
 from stereoweave.cli.root import main
 from stereoweave.io.images import read_image
 from stereoweave.matching.matcher import Matcher
-from stereoweave.rendering.layouts import ANIMATIONS, LAYOUTS, LayoutOptions, median_disparity_px
+from stereoweave.rendering.layouts import ANIMATIONS, LAYOUTS, VIEWER, LayoutOptions, median_disparity_px
 from stereoweave.rendering.renderer import Renderer
 from stereoweave.stereo import StereoPair
 
@@ -120,9 +121,55 @@ def test_a_wiggle_moves(pair, capfd, ending):
     assert capfd.readouterr().out.startswith(said)
 
 
+def test_the_viewer_is_a_page_named_after_the_pictures(pair, capfd):
+    assert run("view left.png right.png --model small --threads 1 -o photo.html") == 0
+    assert capfd.readouterr().out.startswith("photo.html: viewer, 0.")
+    page = Path("photo.html").read_text(encoding="utf-8")
+    assert "<title>left.png + right.png</title>" in page
+    scene = json.loads(re.search(r'id="scene">(.*?)</script>', page)[1])
+    assert scene["size_px"] == [95, 64]
+    assert scene["plane_px"] == pytest.approx(8, abs=0.5)  # the wall stays in place
+
+
+@pytest.mark.parametrize(("size", "size_px"), [("48", (48, 32)), ("900x16", None), ("900x32", (48, 32))])
+def test_views_are_scaled_down_to_a_size(pair, size, size_px):
+    code = run(f"view left.png right.png --model small --threads 1 --size {size} -o v.png")
+    if size_px is None:
+        assert code == 2
+        return
+    with Image.open("v.png") as file:
+        assert file.size == size_px
+    assert run(f"view left.png right.png --model small --layout wiggle --size {size} -o v.webp") == 0
+    with Image.open("v.webp") as file:
+        assert file.size == size_px
+
+
+@pytest.mark.parametrize(
+    ("arguments", "width_px"),
+    [
+        ("--position 1.5 -o v.png", 91),  # half a baseline at a disparity of 8: 4 px that no camera saw
+        ("--layout anaglyph_grey --convergence 20 -o v.png", 91),  # 2 px at each border; test_cropping.py
+        ("--layout wiggle --convergence 20 -o v.gif", 91),
+    ],
+)
+def test_cropping_leaves_what_all_views_show(pair, arguments, width_px):
+    assert run(f"view left.png right.png --model small --threads 1 --crop auto {arguments}") == 0
+    with Image.open(arguments.split()[-1]) as file:
+        assert file.height == 64
+        assert file.width == pytest.approx(width_px, abs=2)  # the disparity is estimated
+
+
 @pytest.mark.parametrize(
     ("arguments", "fragments"),
     [
+        ("--layout viewer -o v.png", ["v.png", ".html", "viewer", "found '.png'"]),
+        ("--layout quilt -o v.html", ["v.html", "viewer", "found quilt"]),
+        ("--layout viewer --strength 4 -o v.html", ["position", "-1 to 2", "-1.9", "strength 4"]),
+        ("--layout viewer --position 0.3 -o v.html", ["--position", "single view", "viewer"]),
+        ("--layout quilt --crop auto -o v.png", ["--crop", "an anaglyph", "found with quilt"]),
+        ("--crop 5 -o v.png", ["--crop", "expected auto", "'5'"]),
+        ("--size big -o v.png", ["--size", "1600x1200", "'big'"]),
+        ("--size 31 -o v.png", ["--size", "at least 32 px", "'31'"]),
         ("--layout holo -o v.png", ["layout", *LAYOUTS, *ANIMATIONS, "found 'holo'"]),
         ("--layout wiggle -o v.png", ["v.png", ".mp4, .gif, .webp", "found '.png'"]),
         ("--layout quilt -o v.mp4", ["v.mp4", ".png", "found '.mp4'"]),
@@ -167,4 +214,4 @@ def test_a_mistake_is_reported_in_one_line_before_anything_is_matched(
 def test_the_help_names_every_layout_and_animation(capfd):
     assert run("view --help") == 0
     words = set(re.findall(r"\w+", capfd.readouterr().out))
-    assert {*LAYOUTS, *ANIMATIONS} <= words
+    assert {*LAYOUTS, *ANIMATIONS, VIEWER} <= words

@@ -1,17 +1,20 @@
 import base64
 import io
+import json
 import re
-from collections.abc import Iterator
+import zlib
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 import pytest
-from browsers import chromium
 from PIL import Image
-from playwright.sync_api import Browser, Page
 
-from stereoweave.outputs.report import POSITIONS, Summary, downscale, summarize, write_report
+import stereoweave
+from stereoweave.outputs.report import POSITIONS, Context, Summary, downscale, summarize, write_report
+from stereoweave.outputs.report_parts import CONTENTS, pack_map
+from stereoweave.outputs.results import FILES
 from stereoweave.stereo import Estimate, StereoCamera, StereoPair
 
 CAMERA = StereoCamera(focal_px=400, baseline_m=0.04, cx_px=160, cy_px=60, doffs_px=0)
@@ -77,21 +80,21 @@ def test_a_depth_is_none_without_a_camera_and_at_infinity(rng):
     assert summary_of(*wall(photograph, SHIFT_PX, toed_in), "a.png").depth_max_m is None
 
 
-def test_each_view_of_the_report_is_the_wall_seen_from_its_position(rng, tmp_path):
+def test_what_has_the_median_disparity_stays_in_place_in_all_views_of_the_report(rng, tmp_path):
     photograph = texture(rng, 120, 320 + SHIFT_PX)
     pair, estimate = wall(photograph, SHIFT_PX, CAMERA)
-    write_report(tmp_path / "report.html", pair, estimate, summary_of(pair, estimate, "a.png"))
+    write_report(tmp_path / "report.html", pair, estimate, summary_of(pair, estimate, "a.png"), Context())
     pictures = pictures_in((tmp_path / "report.html").read_text(encoding="utf-8"))
-    for position in (0.0, 0.25, 0.5, 1.0):
-        moved_px = int(position * SHIFT_PX)
-        expected = photograph[:, moved_px : moved_px + 320]
-        assert difference(pictures[f"View at position {position}"], expected) < 3
+    for position in POSITIONS:
+        # The cameras' views are moved by half of the wall's disparity each, to meet in the middle.
+        view = pictures[f"View at position {position}"]
+        assert difference(view[:, 16:-16], photograph[:, 32:320]) < 3
 
 
 def test_a_large_picture_is_downscaled_with_its_disparity(rng, tmp_path):
     photograph = texture(rng, 160, 2000 + 80)
     pair, estimate = wall(photograph, 80, None)
-    write_report(tmp_path / "report.html", pair, estimate, summary_of(pair, estimate, "a.png"))
+    write_report(tmp_path / "report.html", pair, estimate, summary_of(pair, estimate, "a.png"), Context())
     pictures = pictures_in((tmp_path / "report.html").read_text(encoding="utf-8"))
     halfway = np.asarray(Image.fromarray(photograph[:, 40:2040]).resize((1000, 80)))
     assert pictures["Left image"].shape == (80, 1000, 3)
@@ -103,7 +106,7 @@ def test_depth_is_black_outside_the_left_image_s_content(rng, tmp_path):
     seen = np.ones((120, 320), bool)
     seen[:, :80] = False
     pair = replace(pair, left_seen=seen)
-    write_report(tmp_path / "report.html", pair, estimate, summary_of(pair, estimate, "a.png"))
+    write_report(tmp_path / "report.html", pair, estimate, summary_of(pair, estimate, "a.png"), Context())
     depth = pictures_in((tmp_path / "report.html").read_text(encoding="utf-8"))["Depth in colour"]
     assert depth[:, :72].max() < 8
     assert depth[:, 88:].max(axis=2).min() > 40
@@ -113,20 +116,22 @@ def test_depth_is_black_outside_the_left_image_s_content(rng, tmp_path):
 
 def test_the_page_is_one_file_that_refers_to_no_other(rng, tmp_path):
     pair, estimate = wall(texture(rng, 120, 352), SHIFT_PX, CAMERA)
-    write_report(tmp_path / "report.html", pair, estimate, summary_of(pair, estimate, "a.png", "b.png"))
+    write_report(
+        tmp_path / "report.html", pair, estimate, summary_of(pair, estimate, "a.png", "b.png"), Context()
+    )
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert [file.name for file in tmp_path.iterdir()] == ["report.html"]
     assert "http:" not in page
     assert "https:" not in page
     addresses = re.findall(r'(?:src|href)="([^"]*)"', page)
-    assert len(addresses) == len(POSITIONS) + 4
+    assert len(addresses) == len(POSITIONS) + 5
     assert all(address.startswith("data:") for address in addresses)
 
 
 def test_a_file_name_cannot_add_to_the_page(rng, tmp_path):
     pair, estimate = wall(texture(rng, 60, 132), SHIFT_PX, None)
     summary = summary_of(pair, estimate, "<img src=x>$title.png", "</script>")
-    write_report(tmp_path / "report.html", pair, estimate, summary)
+    write_report(tmp_path / "report.html", pair, estimate, summary, Context())
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "&lt;img src=x&gt;$title.png + &lt;/script&gt;" in page
     assert "<img src=x>" not in page
@@ -136,80 +141,101 @@ def test_the_legend_is_in_metres_with_a_camera_and_in_pixels_without(rng, tmp_pa
     photograph = texture(rng, 60, 132)
     for camera, legend in ((CAMERA, "<span>0.500 m</span>"), (None, "<span>32.0 px</span>")):
         pair, estimate = wall(photograph, SHIFT_PX, camera)
-        write_report(tmp_path / "report.html", pair, estimate, summary_of(pair, estimate, "a.png"))
+        write_report(tmp_path / "report.html", pair, estimate, summary_of(pair, estimate, "a.png"), Context())
         assert legend in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with chromium() as browser:
-        yield browser
+def test_a_file_name_in_a_note_or_in_the_command_cannot_add_to_the_page(rng, tmp_path):
+    pair, estimate = wall(texture(rng, 60, 132), SHIFT_PX, None)
+    hostile = "<script>alert(1)</script>$title & \"'"
+    context = Context(warnings=(hostile,), notes=(hostile,), command=f"stereoweave depth {hostile}")
+    write_report(tmp_path / "report.html", pair, estimate, summary_of(pair, estimate, "a.png"), context)
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "<script>alert" not in page
+    assert page.count("&lt;script&gt;alert(1)&lt;/script&gt;$title &amp; &quot;&#x27;") == 3
 
 
-@pytest.fixture
-def photograph(rng) -> np.ndarray:
-    return texture(rng, 240, 320 + SHIFT_PX)
+def test_the_report_says_how_it_was_made_and_what_is_wrong(rng, tmp_path):
+    pair, estimate = wall(texture(rng, 60, 132), SHIFT_PX, None)
+    context = Context(
+        warnings=("the sides are swapped",),
+        notes=("two pictures in one file",),
+        command="stereoweave depth 'my pair.jps'",
+        date=datetime(2026, 11, 23, 13, 5, tzinfo=UTC),
+    )
+    write_report(tmp_path / "report.html", pair, estimate, summary_of(pair, estimate, "a.png"), context)
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert '<section class="banner"><h2>Warnings</h2><ul><li>the sides are swapped</li></ul>' in page
+    assert "<li>two pictures in one file</li>" in page
+    assert "stereoweave depth &#x27;my pair.jps&#x27;" in page
+    assert f"Stereoweave {stereoweave.__version__}" in page
+    assert "2026-11-23 13:05 UTC" in page
+    write_report(tmp_path / "report.html", pair, estimate, summary_of(pair, estimate, "a.png"), Context())
+    assert "Warnings" not in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
-@pytest.fixture
-def report(photograph, tmp_path) -> Path:
-    """Write a report on a wall 0.5 m away. Returns its path."""
-    pair, estimate = wall(photograph, SHIFT_PX, CAMERA)
-    write_report(tmp_path / "report.html", pair, estimate, summary_of(pair, estimate, "a.png", "b.png"))
-    return tmp_path / "report.html"
+def test_equal_results_have_equal_reports(rng, tmp_path):
+    pair, estimate = wall(texture(rng, 60, 132), SHIFT_PX, CAMERA)
+    for name in ("one.html", "two.html"):
+        write_report(tmp_path / name, pair, estimate, summary_of(pair, estimate, "a.png"), Context())
+    assert (tmp_path / "one.html").read_bytes() == (tmp_path / "two.html").read_bytes()
 
 
-@pytest.fixture
-def page(browser) -> Iterator[Page]:
-    """Yield an empty browser page; the test fails if one of its scripts does."""
-    page = browser.new_page(viewport={"width": 1200, "height": 1600})
-    errors: list[str] = []
-    page.on("pageerror", lambda error: errors.append(str(error)))
-    yield page
-    page.close()
-    assert errors == []
+def test_the_report_links_to_the_files_beside_it(rng, tmp_path):
+    pair, estimate = wall(texture(rng, 60, 132), SHIFT_PX, None)
+    (tmp_path / "disparity.pfm").write_bytes(bytes(2_345_678))
+    (tmp_path / "occluded.png").write_bytes(bytes(1234))
+    context = Context(files=(tmp_path / "disparity.pfm", tmp_path / "occluded.png"))
+    write_report(tmp_path / "report.html", pair, estimate, summary_of(pair, estimate, "a.png"), context)
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert re.findall(r'href="([^"]*)" download>', page) == ["disparity.pfm", "occluded.png"]
+    assert "<span>2.3 MB</span>" in page
+    assert "<span>1 kB</span>" in page
 
 
-@pytest.mark.needs_chromium
-def test_the_slider_changes_the_picture(page, report, photograph):
-    def seen_from(position: float) -> float:
-        """Return the difference between the displayed image and the wall seen from `position`."""
-        shown = np.asarray(Image.open(io.BytesIO(page.locator("#stage").screenshot())).convert("RGB"))
-        moved_px = round(position * SHIFT_PX)
-        expected = Image.fromarray(photograph[:, moved_px : moved_px + 320]).resize(shown.shape[1::-1])
-        return difference(shown, np.asarray(expected))
-
-    page.goto(report.as_uri())
-    assert seen_from(0.5) < 4
-    assert seen_from(0.75) > 12
-
-    for key in ("Tab", "ArrowRight", "ArrowRight"):
-        page.keyboard.press(key)
-    assert page.text_content("#where").startswith("0.75, between the cameras")
-    assert seen_from(0.75) < 4
-    assert seen_from(0.5) > 12
-
-    slider = page.locator("#position").bounding_box()
-    left_end = page.locator(".ends span").first.bounding_box()
-    page.mouse.click(left_end["x"] + left_end["width"] / 2, slider["y"] + slider["height"] / 2)
-    assert page.text_content("#where").startswith("0, at the left camera")
-    assert seen_from(0) < 4
+@pytest.mark.parametrize(("reach_px", "exact_px"), [(40.0, 1 / 128), (9000.0, 9000 / 131070)])
+def test_the_packed_map_holds_disparity_confidence_and_occlusion(rng, reach_px, exact_px):
+    disparity_px = rng.uniform(-reach_px / 4, 3 * reach_px / 4, (6, 9)).astype(np.float32)
+    confidence = rng.uniform(0, 1, (6, 9)).astype(np.float32)
+    confidence[0, :3] = np.nan
+    occluded = rng.uniform(0, 1, (6, 9)) < 0.5
+    packed = pack_map(disparity_px, confidence, occluded)
+    planes = np.frombuffer(zlib.decompress(base64.b64decode(packed["packed"])), np.uint8).reshape(3, 6, 9)
+    levels = np.cumsum(planes[0] + 256 * planes[1].astype(int), axis=1) % 65536
+    found_px = packed["low_px"] + packed["step_px"] * levels
+    np.testing.assert_allclose(found_px, disparity_px, atol=exact_px * 1.01)
+    assert (planes[2][0, :3] == 255).all()
+    known = ~np.isnan(confidence)
+    np.testing.assert_allclose(planes[2][known] % 128 / 100, confidence[known], atol=0.0051)
+    np.testing.assert_array_equal(planes[2][known] >= 128, occluded[known])
 
 
-@pytest.mark.needs_chromium
-def test_pointing_at_the_depth_reads_it(page, report):
-    page.goto(report.as_uri())
-    depth = page.locator("#depth").bounding_box()
-    page.mouse.move(depth["x"] + depth["width"] / 4, depth["y"] + depth["height"] / 2)
-    # 400 px * 0.04 m / 32 px
-    assert page.text_content("#reading") == "(80, 120): disparity 32.00 px, depth 0.500 m"
+def scene_of(folder: Path, pair: StereoPair, estimate: Estimate) -> dict[str, float]:
+    write_report(folder / "report.html", pair, estimate, summary_of(pair, estimate, "a.png"), Context())
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    (data,) = re.findall(r'id="data">(.*?)</script>', page)
+    return json.loads(data)["scene"]
 
 
-@pytest.mark.needs_chromium
-def test_opening_the_report_requests_only_its_own_file(page, report):
-    requested: list[str] = []
-    page.on("request", lambda request: requested.append(request.url))
-    page.goto(report.as_uri())
-    for key in ("Tab", "ArrowRight"):
-        page.keyboard.press(key)
-    assert [url for url in requested if not url.startswith("data:")] == [report.as_uri()]
+def test_the_3_d_view_turns_about_the_middle_of_the_disparities_in_baselines(rng, tmp_path):
+    photograph = texture(rng, 60, 132)
+    with_camera = scene_of(tmp_path, *wall(photograph, SHIFT_PX, CAMERA))
+    # 400 px / 32 px, and four times that
+    assert (with_camera["middle"], with_camera["farthest"]) == (12.5, 50)
+    assert with_camera["least_px"] == SHIFT_PX / 4
+    without = scene_of(tmp_path, *wall(photograph, SHIFT_PX, None))
+    assert (without["focal_px"], without["cx_px"], without["doffs_px"]) == (100, 49.5, 0)
+    assert without["middle"] == 100 / 32
+
+
+def test_a_scene_that_is_infinitely_far_for_its_camera_is_shown_as_without_a_camera(rng, tmp_path):
+    toed_in = StereoCamera(focal_px=400, baseline_m=0.04, cx_px=0, cy_px=0, doffs_px=-SHIFT_PX)
+    scene = scene_of(tmp_path, *wall(texture(rng, 60, 132), SHIFT_PX, toed_in))
+    assert (scene["focal_px"], scene["middle"]) == (100, 100 / 32)
+    pair, estimate = wall(texture(rng, 60, 132), SHIFT_PX, None)
+    estimate = replace(estimate, disparity_px=estimate.disparity_px - 72)
+    assert scene_of(tmp_path, pair, estimate)["doffs_px"] == 41  # the whole wall at -40 px: moved to 1 px
+
+
+def test_each_file_of_a_result_is_described_in_the_report():
+    assert set(CONTENTS) == set(FILES) - {"report.html"}

@@ -1,3 +1,6 @@
+import html
+import re
+import shlex
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -8,6 +11,7 @@ import trimesh
 from PIL import Image
 
 from stereoweave.cli.depth import depth
+from stereoweave.cli.root import main
 from stereoweave.errors import OutputInUseError, StereoweaveError
 from stereoweave.io.images import read_image, write_image
 from stereoweave.io.maps import read_disparity_png, read_pfm, read_pixels
@@ -24,6 +28,7 @@ from stereoweave.stereo import Estimate, StereoCamera, StereoPair
 TEXTURED = Path(__file__).resolve().parents[1] / "textured_pair"
 CALIBRATION = "cam0=[100 0 48; 0 100 32; 0 0 1]\ndoffs=0\nbaseline=80\nwidth=96\nheight=64\n"
 CAMERA = StereoCamera(focal_px=100.0, baseline_m=0.08, cx_px=48.0, cy_px=32.0)
+METRES = ["--focal-px", "100", "--baseline-m", "0.08"]
 PICTURES = [Path("left.png"), Path("right.png")]
 PLAIN = DepthJob(backend=Backend(threads=1))
 WITH_CAMERA = replace(PLAIN, request=Request(calibration=Path("calib.txt")))
@@ -230,6 +235,36 @@ def test_the_command_writes_the_requested_files(folder, capfd):
     depth(Path("out"), PICTURES, calib=Path("calib.txt"), write=["cloud.ply", "depth.npy"])
     assert names_in("out") == {*ALWAYS, "depth.png", "cloud.ply", "depth.npy"}
     assert "report: out/report.html" in capfd.readouterr().out
+
+
+def test_the_report_has_the_warnings_the_command_and_the_files_of_its_folder(folder, capfd):
+    """The right picture is 6 px lower: a warning, which names the command's option."""
+    write_image("low.png", np.roll(read_image(TEXTURED / "right.png"), 6, axis=0))
+    assert (
+        main(
+            ["depth", str(TEXTURED / "left.png"), "low.png", "-o", "my out", "--write", "depth.npy", *METRES]
+        )
+        == 0
+    )
+    report = Path("my out/report.html").read_text(encoding="utf-8")
+    (warning,) = [line for line in capfd.readouterr().out.splitlines() if "--rectify" in line]
+    assert f'class="banner"><h2>Warnings</h2><ul><li>{html.escape(warning)}</li></ul>' in report
+    command = shlex.join(["stereoweave", "depth", str(TEXTURED / "left.png"), "low.png", "-o", "my out"])
+    assert html.escape(f"{command} --write depth.npy --focal-px 100") in report
+    linked = set(re.findall(r'href="([^"]*)" download', report))
+    assert linked == names_in("my out") - {"report.html"}
+    assert "depth.npy" in linked
+
+
+def test_the_reports_of_equal_pairs_differ_only_in_date_and_time(folder):
+    pages = []
+    for out in ("one", "two"):
+        make_depth(PICTURES, Path(out), WITH_CAMERA)
+        page = Path(out, "report.html").read_text(encoding="utf-8")
+        page = re.sub(r"<dt>Date</dt><dd>\d{4}-\d\d-\d\d \d\d:\d\d UTC</dd>", "", page)
+        pages.append(re.sub(r"\d+ ms|\d+\.\d s\b", "", page))
+    assert pages[0] == pages[1]
+    assert "Date" not in pages[0]
 
 
 def test_a_camera_from_numbers_has_a_centred_principal_point():

@@ -249,11 +249,13 @@ def test_a_layout_is_chosen_by_name_or_by_the_file_s_ending(path, name, expected
 @pytest.mark.parametrize(
     ("path", "name", "expected"),
     [
-        ("view.png", "quild", "side_by_side, .*, quilt, .*, wiggle, found 'quild'"),
+        ("view.png", "quild", "side_by_side, .*, quilt, .*, wiggle, viewer, found 'quild'"),
         ("view.mpo", "crossed", r"view\.mpo: expected the layout side_by_side .* found crossed"),
         ("view.jps", "quilt", r"view\.jps: expected the layout crossed .* found quilt"),
         ("view.png", "wiggle", r"view\.png: expected an animation file extension \(\.mp4, \.gif, \.webp"),
         ("view.gif", "quilt", r"view\.gif: expected a picture file extension \(\.png"),
+        ("view.png", "viewer", r"view\.png: expected the file extension \.html for the layout viewer"),
+        ("view.html", "quilt", r"view\.html: expected the layout viewer .* found quilt"),
         ("view.mp4", None, r"view\.mp4: expected a picture file extension \(\.png"),
     ],
 )

@@ -1,0 +1,152 @@
+"""Files of new views: one view, a layout of several, an animation or the 3-D viewer."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+
+from stereoweave.errors import StereoweaveError
+from stereoweave.io.animation import write_animation
+from stereoweave.io.images import write_image
+from stereoweave.outputs.viewer import make_viewer, write_viewer
+from stereoweave.outputs.viewer_scene import LARGEST_PX, POSITIONS
+from stereoweave.rendering.cropping import find_common_part
+from stereoweave.rendering.layouts import (
+    ANIMATIONS,
+    LAYOUTS,
+    VIEWER,
+    LayoutOptions,
+    add_mark,
+    check_positions,
+    median_disparity_px,
+    render_views,
+    write_picture,
+)
+from stereoweave.rendering.renderer import Renderer, check_position
+from stereoweave.rendering.scaling import fit_size, scale_down
+from stereoweave.stereo import Estimate, StereoPair
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewFile:
+    """A file of new views, with all its settings, which are checked at once.
+
+    Attributes:
+        path: The file.
+        name: Its layout (`layouts.choose_layout`); None for a single view.
+        position, up, forward: Viewpoint of a single view.
+        strength: Factor by which the baseline is multiplied.
+        convergence_px: Disparity of the points that stay in place; None for the scene's median disparity.
+        layout_options: Options of the layout.
+        size_px: Largest width and height of each view; None for the pictures' size.
+        crops: Whether to cut off the borders that not every view shows.
+        threads: Number of threads; default: all cores.
+    """
+
+    path: Path
+    name: str | None
+    position: float = 0.5
+    up: float = 0.0
+    forward: float = 0.0
+    strength: float = 1.0
+    convergence_px: float | None = None
+    layout_options: LayoutOptions = LayoutOptions()
+    size_px: tuple[int, int] | None = None
+    crops: bool = False
+    threads: int | None = None
+
+    def __post_init__(self) -> None:
+        check_position(0.5, up=self.up, forward=self.forward)
+        check_positions(self._positions, self.strength)
+        if self.crops and not self._is_overlaid:
+            raise StereoweaveError(
+                f"expected only for a single view, an anaglyph or an animation, found with {self.name}",
+                setting="crop",
+            )
+
+    @property
+    def _positions(self) -> tuple[float, ...]:
+        """Positions of the views, the outermost included."""
+        if self.name is None:
+            return (self.position,)
+        if self.name == VIEWER:
+            return POSITIONS
+        return LAYOUTS[self.name].positions if self.name in LAYOUTS else ANIMATIONS[self.name].positions
+
+    @property
+    def _is_overlaid(self) -> bool:
+        """Whether the file shows its views in one place, each in full size."""
+        return self.name is None or self.name in ANIMATIONS or self.name.startswith("anaglyph")
+
+    def add_mark(self, pair: StereoPair) -> "ViewFile":
+        """Return the same file with the mark of its layout in its name."""
+        if self.name not in LAYOUTS:
+            return self
+        return replace(self, path=add_mark(self.path, self.name, pair, self.layout_options))
+
+    def write(self, pair: StereoPair, estimate: Estimate, pictures: Iterable[Path]) -> str:
+        """Write the file from a pair and its estimate, and return a description of it for the user.
+
+        `pictures` are the pair's files, of which the viewer shows the names.
+        """
+        plane_px = median_disparity_px(estimate) if self.convergence_px is None else self.convergence_px
+        if self.name == VIEWER:
+            return self._write_viewer(pair, estimate, plane_px, pictures)
+        if self.size_px is not None:
+            width = pair.left.shape[1]
+            pair, estimate = scale_down(pair, estimate, fit_size(pair.left.shape, self.size_px))
+            plane_px *= pair.left.shape[1] / width
+        renderer = Renderer(
+            pair, estimate, strength=self.strength, convergence_px=plane_px, threads=self.threads
+        )
+        if self.name is None:
+            return self._write_view(renderer)
+        return self._write_layout(renderer, self.name)
+
+    def _find_part(self, renderer: Renderer) -> tuple[slice, slice]:
+        """Return the rows and columns of the views to write."""
+        if not self.crops:
+            return slice(None), slice(None)
+        ends = sorted({min(self._positions), max(self._positions)})
+        return find_common_part(renderer, ends, up=self.up, forward=self.forward)
+
+    def _write_view(self, renderer: Renderer) -> str:
+        part = self._find_part(renderer)
+        view = renderer.view(self.position, up=self.up, forward=self.forward)
+        write_image(self.path, np.ascontiguousarray(view.image[part]))
+        invented_percent = 100 * (~view.drawn[part]).mean()
+        return f"view at {self.position:g}, {invented_percent:.1f} % of it seen by neither camera"
+
+    def _write_layout(self, renderer: Renderer, name: str) -> str:
+        part = self._find_part(renderer)
+        if name in LAYOUTS:
+            picture = np.ascontiguousarray(LAYOUTS[name].compose(renderer, self.layout_options)[part])
+            write_picture(self.path, picture)
+            return f"{name}, {picture.shape[1]}x{picture.shape[0]} px"
+        motion = ANIMATIONS[name]
+        turns = motion.turns(self.path)
+        frames = render_views(renderer, motion.positions * turns)
+        write_animation(self.path, (_cut(frame, part) for frame in frames), motion.frame_ms)
+        count = len(motion.positions) * turns
+        return f"{name}, {count} frames in {count * motion.frame_ms / 1000:g} s"
+
+    def _write_viewer(
+        self, pair: StereoPair, estimate: Estimate, plane_px: float, pictures: Iterable[Path]
+    ) -> str:
+        page = make_viewer(
+            pair,
+            estimate,
+            title=" + ".join(picture.name for picture in pictures),
+            size_px=self.size_px or LARGEST_PX,
+            strength=self.strength,
+            convergence_px=plane_px,
+            threads=self.threads,
+        )
+        write_viewer(self.path, page)
+        return f"{VIEWER}, {len(page) / 1e6:.2g} MB; open it in a browser"
+
+
+def _cut(frame: UInt8[np.ndarray, "h w 3"], part: tuple[slice, slice]) -> UInt8[np.ndarray, "h2 w2 3"]:
+    return np.ascontiguousarray(frame[part])

@@ -1,0 +1,58 @@
+"""Scaling of a pair together with its estimate and camera."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from stereoweave.stereo import Estimate, StereoCamera, StereoPair
+
+
+def fit_size(shape: tuple[int, ...], largest_px: tuple[int, int]) -> tuple[int, int]:
+    """Return width and height of an image scaled down, never up, to fit a width and a height."""
+    height, width = shape[:2]
+    scale = min(1.0, largest_px[0] / width, largest_px[1] / height)
+    return max(1, round(width * scale)), max(1, round(height * scale))
+
+
+def scale_down(pair: StereoPair, estimate: Estimate, size_px: tuple[int, int]) -> tuple[StereoPair, Estimate]:
+    """Return the pair and its estimate at a smaller size, with disparities and camera scaled along.
+
+    Args:
+        pair: The pair.
+        estimate: The pair's estimate.
+        size_px: Width and height of the result, in the pair's proportions and not above its size.
+    """
+    height, width = pair.left.shape[:2]
+    if size_px == (width, height):
+        return pair, estimate
+    scale_x, scale_y = size_px[0] / width, size_px[1] / height
+    left, right = (
+        cv2.resize(image, size_px, interpolation=cv2.INTER_AREA) for image in (pair.left, pair.right)
+    )
+    seen = [None if x is None else _resize_nearest(x, size_px) for x in (pair.left_seen, pair.right_seen)]
+    camera = None if pair.camera is None else _scale_camera(pair.camera, scale_x, scale_y)
+    small = StereoPair(left=left, right=right, camera=camera, left_seen=seen[0], right_seen=seen[1])
+    return small, Estimate(
+        disparity_px=_resize_nearest(estimate.disparity_px, size_px) * np.float32(scale_x),
+        right_disparity_px=_resize_nearest(estimate.right_disparity_px, size_px) * np.float32(scale_x),
+        confidence=_resize_nearest(estimate.confidence, size_px),
+        occluded=_resize_nearest(estimate.occluded, size_px),
+    )
+
+
+def _scale_camera(camera: StereoCamera, scale_x: float, scale_y: float) -> StereoCamera:
+    # Pixel centres are integers, so the picture's corner is at -0.5.
+    return replace(
+        camera,
+        focal_px=camera.focal_px * scale_x,
+        cx_px=(camera.cx_px + 0.5) * scale_x - 0.5,
+        cy_px=(camera.cy_px + 0.5) * scale_y - 0.5,
+        doffs_px=camera.doffs_px * scale_x,
+    )
+
+
+def _resize_nearest(values: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
+    """Resize a map by nearest neighbour, because means across depth edges lie on no surface."""
+    numbers = values.view(np.uint8) if values.dtype == bool else values
+    return cv2.resize(numbers, size_px, interpolation=cv2.INTER_NEAREST_EXACT).view(values.dtype)
