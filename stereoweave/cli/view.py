@@ -84,8 +84,8 @@ Crop = Annotated[
     str | None,
     typer.Option(
         metavar="auto",
-        help="auto cuts off the borders that not every view of the picture really shows, and that are "
-        "invented otherwise: of a single view, an anaglyph or an animation.",
+        help="auto cuts off the borders of a single view, an anaglyph or an animation that not all its views "
+        "really show (default: such borders are filled).",
     ),
 ]
 Calib = Annotated[

@@ -19,7 +19,7 @@ LARGEST_PX = (1600, 1600)
 """Largest width and height of the packed images."""
 _UP = 0.2
 _MOST_BYTES = 2_900_000
-_FRONT_QUALITIES = (88, 80, 70, 55, 40, 25, 10)
+_FRONT_QUALITIES = (92, 88, 80, 70, 55, 40, 25, 10)
 # The layer behind is seen in narrow strips only.
 _LOWER_QUALITY = 8
 # Steps of the packed disparity; at 1/8 px they cannot be seen.
@@ -190,6 +190,6 @@ def _address(image: UInt8[np.ndarray, "h w 3"], quality: int | None = None) -> s
     if quality is None:
         Image.fromarray(image).save(file, "WEBP", lossless=True, method=4)
     else:
-        Image.fromarray(image).save(file, "JPEG", quality=quality, optimize=True)
+        Image.fromarray(image).save(file, "JPEG", quality=quality, subsampling=0)
     kind = "webp" if quality is None else "jpeg"
     return f"data:image/{kind};base64,{base64.b64encode(file.getvalue()).decode()}"

@@ -288,6 +288,21 @@ def test_webgl_1_is_enough(browser, photo, scene):
 
 
 @pytest.mark.needs_chromium
+def test_the_view_comes_back_after_the_system_took_the_graphics_away(browser, photo, scene):
+    page = open_page(browser, photo)
+    page.evaluate(
+        """() => new Promise(done => {
+          const canvas = document.getElementById("view");
+          const graphics = stereoweaveViewer.view.gl.getExtension("WEBGL_lose_context");
+          canvas.addEventListener("webglcontextlost", () => setTimeout(() => graphics.restoreContext()));
+          canvas.addEventListener("webglcontextrestored", done);
+          graphics.loseContext();
+        })"""
+    )
+    assert difference(seen_from(page, 0), cut(scene[0].left, photo)).mean() < 4
+
+
+@pytest.mark.needs_chromium
 def test_the_page_works_in_a_frame_of_a_page_with_a_policy_of_its_own(browser, photo, tmp_path):
     policy = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
     (tmp_path / "outer.html").write_text(
