@@ -8,9 +8,9 @@ from stereoweave.system.telemetry import disable_telemetry
 if TYPE_CHECKING:
     from stereoweave.errors import FormatError, MatcherError, StereoweaveError
     from stereoweave.io.images import read_image
-    from stereoweave.matching.estimate import estimate
     from stereoweave.matching.matcher import Matcher
     from stereoweave.matching.opencv_interface.stereo_matcher import StereoMatcher
+    from stereoweave.pictures.estimate import estimate
     from stereoweave.rendering.renderer import render
     from stereoweave.rendering.synthesize import synthesize
     from stereoweave.stereo import DepthCurve, Estimate, Sample, StereoCamera, StereoPair, View
@@ -29,7 +29,7 @@ _HOMES = {
     "StereoPair": "stereo",
     "StereoweaveError": "errors",
     "View": "stereo",
-    "estimate": "matching.estimate",
+    "estimate": "pictures.estimate",
     "read_image": "io.images",
     "render": "rendering.renderer",
     "synthesize": "rendering.synthesize",

@@ -147,14 +147,19 @@ class Estimate:
             left image.
         confidence: Estimated probability, float32 in 0..1, that disparity_px is within 1 px of the truth.
         occluded: Mask, bool, of the pixels that only the left camera sees.
+        pair: The aligned pair that the estimate belongs to, if `estimate` aligned it; None if the estimate
+            belongs to the images as given.
     """
 
     disparity_px: Float[np.ndarray, "h w"]
     right_disparity_px: Float[np.ndarray, "h w"]
     confidence: Float[np.ndarray, "h w"]
     occluded: Bool[np.ndarray, "h w"]
+    pair: StereoPair | None = None
 
     def __post_init__(self) -> None:
+        if self.pair is not None:
+            check_kind("pair", self.pair, StereoPair)
         check_array("disparity_px", self.disparity_px, "f", 2)
         shape = self.disparity_px.shape
         for name in ("disparity_px", "right_disparity_px", "confidence", "occluded"):

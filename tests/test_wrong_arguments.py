@@ -96,7 +96,7 @@ def calls() -> list[Call]:
     place = {"up": 0.1, "forward": 0.1}
     look = {"strength": 1.0, "convergence_px": 1.0}
     return [
-        Call("estimate", sw.estimate, **pair, **how, **steps, range_px=(0, 20)),
+        Call("estimate", sw.estimate, **pair, **how, **steps, range_px=(0, 20), align="auto"),
         Call("Matcher", sw.Matcher, **how),
         Call("Matcher.estimate", matcher.estimate, **pair, **steps),
         Call("Matcher.estimate_many", matcher.estimate_many, pairs=[PAIR], **steps),
@@ -110,7 +110,7 @@ def calls() -> list[Call]:
         Call("StereoCamera.depth_m", CAMERA.depth_m, disparity_px=FLAT),
         Call("StereoCamera.disparity_px", CAMERA.disparity_px, depth_m=FLAT),
         Call("StereoPair", sw.StereoPair, **pair, camera=CAMERA, left_seen=seen, right_seen=seen),
-        Call("Estimate", sw.Estimate, **maps),
+        Call("Estimate", sw.Estimate, **maps, pair=PAIR),
         Call("DepthCurve", sw.DepthCurve, exponent=1.5, max_disparity_px=192.0),
         Call("DepthCurve of depth", sw.DepthCurve, max_depth_m=10.0),
         Call("StereoMatcher", sw.StereoMatcher, **sgbm, min_confidence=0.5, refined=False, **how),

@@ -1,4 +1,4 @@
-"""Matching of pairs of any size and disparity range: `stereoweave.estimate`.
+"""Matching of pairs of any size and disparity range.
 
 A network covers disparities from 0 to its maximum, in images up to a certain size. For other disparities, the
 right image is shifted along its rows. For wider ranges and larger images, both images are scaled down, and
@@ -8,7 +8,6 @@ right image is shifted along its rows. For wider ranges and larger images, both 
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import NamedTuple
 
 import cv2
@@ -16,9 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
 from stereoweave.errors import StereoweaveError
-from stereoweave.io.arrays import ImageLike, as_rgb
 from stereoweave.io.images import SMALLEST_SIDE_PX
-from stereoweave.matching.backend import Backend
 from stereoweave.matching.disparity_range import find_range, goes_beyond
 from stereoweave.matching.left_right_check import at_match, find_occluded
 from stereoweave.matching.matcher import (
@@ -26,7 +23,6 @@ from stereoweave.matching.matcher import (
     Matcher,
 )
 from stereoweave.matching.options import DEFAULT_OPTIONS, MatchOptions
-from stereoweave.matching.providers import CPU
 from stereoweave.matching.refine import right_confidence
 from stereoweave.matching.upsample import enlarge
 from stereoweave.stereo import LONGEST_SIDE_PX, Estimate, StereoPair
@@ -59,42 +55,6 @@ class _NetworkInput(NamedTuple):
 
     small: StereoPair
     least_px: int | None = None
-
-
-def estimate(  # noqa: PLR0913 - all but the images are keyword-only and optional
-    left: ImageLike,
-    right: ImageLike,
-    *,
-    model: str | Path = "small",
-    threads: int | None = None,
-    provider: str = CPU,
-    refined: bool = False,
-    raw: bool = False,
-    range_px: tuple[float, float] | None = None,
-) -> Estimate:
-    """Estimate both views' disparities, the confidence and the occlusion mask of a rectified pair.
-
-    Args:
-        left: Left image of at least 32x32 px: path, PIL image, RGB array [H, W, 3] or [3, H, W], or PyTorch
-            tensor, of uint8, uint16 or floats in 0..1; see `arrays.as_rgb`.
-        right: Right image of the same size.
-        model: Name of a shipped network, `best`, or the path of an .onnx matcher file. `best` runs the
-            network `base`, runs it again at up to 1.5 times the size, and refines the result. The network is
-            loaded on the first call and cached.
-        threads: Maximum number of threads; default: all cores.
-        provider: Execution provider: cpu, cuda, tensorrt, openvino, coreml or directml.
-        refined: See `MatchOptions`.
-        raw: See `MatchOptions`.
-        range_px: See `MatchOptions`.
-
-    Raises:
-        ValueError: MatcherError for an unknown model or an unavailable provider, ProviderError for a provider
-            that fails, and StereoweaveError for invalid images or options.
-    """
-    options = MatchOptions(range_px=range_px, refined=refined, raw=raw)
-    pair = StereoPair(left=as_rgb(left, "left"), right=as_rgb(right, "right"))
-    matcher = Backend(model=model, threads=threads, provider=provider).matcher()
-    return match(matcher, pair, options)
 
 
 def match(matcher: Matcher, pair: StereoPair, options: MatchOptions = DEFAULT_OPTIONS) -> Estimate:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -166,7 +167,7 @@ def render(  # noqa: PLR0913 - the options of one view
     Args:
         left: Left image, as for `estimate`: path, PIL image, array or tensor.
         right: Right image of the same size.
-        estimate: The pair's estimate (`stereoweave.estimate`).
+        estimate: The pair's estimate (`stereoweave.estimate`). If it holds an aligned pair, that is rendered.
         position: Position from -1 to 2; 0 is the left camera and 1 the right one.
         threads: Number of threads; at most four are used. Default: all cores.
         strength: Factor that scales the baseline about its middle, as in `Renderer`.
@@ -183,7 +184,8 @@ def render(  # noqa: PLR0913 - the options of one view
     Raises:
         ValueError: The sizes differ, or a number is out of range.
     """
-    pair = StereoPair(left=as_rgb(left, "left"), right=as_rgb(right, "right"), camera=camera)
+    given = estimate.pair or StereoPair(left=as_rgb(left, "left"), right=as_rgb(right, "right"))
+    pair = replace(given, camera=camera)
     renderer = Renderer(pair, estimate, strength=strength, convergence_px=convergence_px, threads=threads)
     return renderer.view(position, up=up, forward=forward)
 

@@ -3,10 +3,12 @@
 from pathlib import Path
 
 from stereoweave.io.arrays import ImageLike, as_rgb
-from stereoweave.matching.estimate import estimate
+from stereoweave.matching.backend import Backend
+from stereoweave.matching.estimate import match
+from stereoweave.matching.options import MatchOptions
 from stereoweave.matching.providers import CPU
 from stereoweave.rendering.renderer import check_position, render
-from stereoweave.stereo import View
+from stereoweave.stereo import StereoPair, View
 
 
 def synthesize(  # noqa: PLR0913 - all but the first three are optional
@@ -36,6 +38,7 @@ def synthesize(  # noqa: PLR0913 - all but the first three are optional
         ValueError: See `estimate` and `render`. The position is checked before matching.
     """
     check_position(position)
-    left, right = as_rgb(left, "left"), as_rgb(right, "right")
-    found = estimate(left, right, model=model, threads=threads, provider=provider, refined=True)
-    return render(left, right, found, position, threads)
+    pair = StereoPair(left=as_rgb(left, "left"), right=as_rgb(right, "right"))
+    matcher = Backend(model=model, threads=threads, provider=provider).matcher()
+    found = match(matcher, pair, MatchOptions(refined=True))
+    return render(pair.left, pair.right, found, position, threads)

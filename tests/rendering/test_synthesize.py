@@ -6,7 +6,7 @@ import stereoweave as sw
 from stereoweave.bench.metrics import psnr_db
 from stereoweave.errors import MatcherError
 from stereoweave.io.images import read_image
-from stereoweave.matching.estimate import estimate
+from stereoweave.pictures.estimate import estimate
 from stereoweave.rendering.renderer import render
 from stereoweave.rendering.synthesize import synthesize
 

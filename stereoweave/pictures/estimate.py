@@ -1,0 +1,58 @@
+"""From two pictures to an estimate in one call: `stereoweave.estimate`."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+from stereoweave.cameras import auto_align
+from stereoweave.errors import StereoweaveError
+from stereoweave.io.arrays import ImageLike, as_rgb
+from stereoweave.matching.backend import Backend
+from stereoweave.matching.estimate import match
+from stereoweave.matching.options import MatchOptions
+from stereoweave.matching.providers import CPU
+from stereoweave.stereo import Estimate, StereoPair
+
+
+def estimate(  # noqa: PLR0913 - all but the images are keyword-only and optional
+    left: ImageLike,
+    right: ImageLike,
+    *,
+    model: str | Path = "small",
+    threads: int | None = None,
+    provider: str = CPU,
+    refined: bool = False,
+    raw: bool = False,
+    range_px: tuple[float, float] | None = None,
+    align: Literal["auto"] | None = None,
+) -> Estimate:
+    """Estimate both views' disparities, the confidence and the occlusion mask of a pair.
+
+    Args:
+        left: Left image of at least 32x32 px: path, PIL image, RGB array [H, W, 3] or [3, H, W], or PyTorch
+            tensor, of uint8, uint16 or floats in 0..1; see `arrays.as_rgb`.
+        right: Right image of the same size.
+        model: Name of a shipped network, `best`, or the path of an .onnx matcher file. `best` runs the
+            network `base`, runs it again at up to 1.5 times the size, and refines the result. The network is
+            loaded on the first call and cached.
+        threads: Maximum number of threads; default: all cores.
+        provider: Execution provider: cpu, cuda, tensorrt, openvino, coreml or directml.
+        refined: See `MatchOptions`.
+        raw: See `MatchOptions`.
+        range_px: See `MatchOptions`.
+        align: "auto" for pictures of unknown cameras: if the rows are apart or the sides are swapped, the
+            pair is aligned first (`auto_align.align`). The estimate then belongs to the aligned pair, which
+            it holds as `pair`. Default: the images must be rectified.
+
+    Raises:
+        ValueError: MatcherError for an unknown model or an unavailable provider, ProviderError for a provider
+            that fails, and StereoweaveError for invalid images or options.
+    """
+    if align is not None and not (isinstance(align, str) and align == "auto"):
+        raise StereoweaveError(f"expected 'auto' or None, got {align!r}", setting="align")
+    options = MatchOptions(range_px=range_px, refined=refined, raw=raw)
+    given = StereoPair(left=as_rgb(left, "left"), right=as_rgb(right, "right"))
+    matcher = Backend(model=model, threads=threads, provider=provider).matcher()
+    pair = auto_align.align(given).pair if align else given
+    found = match(matcher, pair, options)
+    return found if pair is given else replace(found, pair=pair)

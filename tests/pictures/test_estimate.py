@@ -1,0 +1,54 @@
+"""`stereoweave.estimate` with alignment; tests of matching itself are in tests/matching/test_estimate.py."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import stereoweave as sw
+from stereoweave.errors import StereoweaveError
+from stereoweave.io.images import read_pair
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+DOWN_PX = 12
+
+
+@pytest.fixture(scope="module")
+def example():
+    return read_pair(EXAMPLES / "left.png", EXAMPLES / "right.png")
+
+
+@pytest.fixture(scope="module")
+def lower(example):
+    """Return the example pair with a right image that is 12 px lower."""
+    return example.left[:-DOWN_PX], example.right[DOWN_PX:]
+
+
+def test_a_pair_out_of_line_is_aligned_on_request(example, lower):
+    found = sw.estimate(*lower, align="auto")
+    expected_px = sw.estimate(example.left, example.right).disparity_px[:-DOWN_PX]
+    sure = found.pair.left_seen & (found.confidence > 0.9)
+    assert sure.mean() > 0.6
+    # Where infinity is after alignment is unknown, so all disparities may be off by the same number.
+    off_px = (found.disparity_px - expected_px)[sure]
+    assert np.median(np.abs(off_px - np.median(off_px))) < 0.5
+    unaligned_px = (sw.estimate(*lower).disparity_px - expected_px)[sure]
+    assert np.median(np.abs(unaligned_px - np.median(unaligned_px))) > 2
+
+
+def test_a_view_of_an_aligned_estimate_shows_the_aligned_pair(lower):
+    found = sw.estimate(*lower, align="auto")
+    view = sw.render(*lower, found, 0.0)
+    np.testing.assert_array_equal(view.image, found.pair.left)
+
+
+def test_a_sound_pair_gives_the_same_with_and_without_alignment(example):
+    aligned = sw.estimate(example.left, example.right, align="auto")
+    assert aligned.pair is None
+    np.testing.assert_array_equal(aligned.disparity_px, sw.estimate(example.left, example.right).disparity_px)
+
+
+@pytest.mark.usefixtures("without_shape_checks")
+def test_another_kind_of_alignment_is_refused(example):
+    with pytest.raises(StereoweaveError, match="^align: expected 'auto' or None, got 'always'"):
+        sw.estimate(example.left, example.right, align="always")
