@@ -90,7 +90,7 @@ def show(  # noqa: PLR0913 - source, output and settings
         disparity_px = match(matcher, pair).disparity_px
         range_px = follow_range(range_px, disparity_px)
         tally.add(moment, time.monotonic())
-        status = f"{tally.rate:.1f} frames/s, {1000 * (tally.last_s[-1] - moment.taken_s):.0f} ms"
+        status = f"{tally.rate:.1f} frames/s, {1000 * (tally.last_s[-1] - moment.taken_s):.0f} ms behind"
         screen.show(compose(pair, disparity_px, range_px, status))
 
 
