@@ -1,14 +1,15 @@
 """Matching, drawing, measurement and output for a visitor to the web page, without the user interface."""
 
 import zipfile
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from stereoweave.app.stereo_pictures import StereoPicture
 from stereoweave.errors import Note, StereoweaveError
 from stereoweave.io.colormap import colour_disparity, find_colour_range_px
 from stereoweave.matching.backend import Backend
@@ -29,16 +30,21 @@ _MOST_POINTS = 300_000
 _FARTHEST = 4.0
 # Files up to this total size, reached at about 8 megapixels, are stored twice: individually and in the zip.
 _MOST_ZIPPED_BYTES = 300 * 1024**2
+_FARTHEST_SHOWN_M = 1000
 _NO_METRES = "For metres, give a calibration file, or the focal length and the baseline."
 
 
 @dataclass(frozen=True, kw_only=True)
 class Session:
-    """A visitor's latest result, the renderer for its views, and the folder that contains its files."""
+    """A visitor's latest result, the renderer for its views, and the folder that contains its files.
+
+    `stereo_pictures` are the 3-D pictures made so far, by kind.
+    """
 
     result: Result
     renderer: Renderer
     folder: Path
+    stereo_pictures: dict[str, StereoPicture] = field(default_factory=dict)
 
     def given_px(self, shown_px: tuple[int, int]) -> tuple[int, int]:
         """Convert the column and row of a pixel in the displayed image to those in the full-size image."""
@@ -58,39 +64,64 @@ class Uploads:
     backend: Backend
 
 
-def match_uploads(uploads: Uploads, folder: Path, report_progress: Callable[[float, str], None]) -> Session:
-    """Match uploaded pictures, and return a session that keeps its files in `folder`.
+def match_uploads(uploads: Uploads, report_progress: Callable[[float, str], None]) -> Result:
+    """Match uploaded pictures.
 
     `report_progress` is called with the completed fraction, from 0 to 1, and the name of the next step.
     """
     if not uploads.pictures:
         raise StereoweaveError("expected a left and a right picture, or one file with both views, found none")
-    for file in (*uploads.pictures, uploads.request.calibration):
+    check_uploads([*uploads.pictures, uploads.request.calibration])
+    report_progress(0.1, "reading")
+    prepared = prepare(uploads.pictures, uploads.request)
+    height, width = prepared.pair.left.shape[:2]
+    report_progress(0.3, f"matching {width}×{height} px")
+    return run(prepared, uploads.backend.matcher(), MatchOptions(refined=True))
+
+
+def check_uploads(files: Iterable[Path | None]) -> None:
+    """Raise a StereoweaveError if the page has already removed an uploaded file."""
+    for file in files:
         if file and not file.exists():
             raise StereoweaveError(
                 f"{file.name}: expected an upload from the last hour, found an expired one; "
                 "upload the file again"
             )
-    report_progress(0.1, "reading")
-    prepared = prepare(uploads.pictures, uploads.request)
-    height, width = prepared.pair.left.shape[:2]
-    report_progress(0.3, f"matching {width}×{height} px")
-    result = run(prepared, uploads.backend.matcher(), MatchOptions(refined=True))
-    report_progress(0.6, "showing")
+
+
+def open_session(result: Result, folder: Path) -> Session:
+    """Return a session for a result, which keeps its files in `folder`."""
     renderer = Renderer(*downscale(result.pair, result.estimate, _LONGER_SIDE_PX))
     return Session(result=result, renderer=renderer, folder=folder)
 
 
-def write_all(session: Session) -> tuple[list[Path], list[Note]]:
-    """Write the result's files in all formats.
+@dataclass(frozen=True, kw_only=True)
+class Written:
+    """A result's files in all formats, an archive of them, and what the user should know.
 
-    Returns:
-        The files, and notes on skipped files and on likely defects of the pair.
+    Attributes:
+        files: The files.
+        archive: The archive; None if the files are too large to be stored twice.
+        notes: Notes on skipped files.
+        warnings: Notes on likely defects of the pair.
     """
-    result = session.result
+
+    files: list[Path]
+    archive: Path | None
+    notes: list[Note]
+    warnings: list[Note]
+
+
+def write_all(result: Result, folder: Path, report_progress: Callable[[float, str], None]) -> Written:
+    """Write the result's files in all formats, and check the pair."""
+    report_progress(0.7, "checking the pictures")
+    warnings = result.warnings()
+    report_progress(0.8, "writing the files")
     names = [name for name in FILES if result.pair.camera or not needs_camera(name)]
-    notes = write_files(session.folder, names, result) + result.warnings()
-    return [file for file in map(session.folder.joinpath, names) if file.exists()], notes
+    notes = write_files(folder, names, result)
+    files = [file for file in map(folder.joinpath, names) if file.exists()]
+    archive = zip_files(folder / "stereoweave.zip", files)
+    return Written(files=files, archive=archive, notes=notes, warnings=warnings)
 
 
 def zip_files(file: Path, files: Sequence[Path]) -> Path | None:
@@ -177,7 +208,10 @@ def format_summary(summary: Summary) -> str:
 
 
 def _format_metres(depth_m: float | None) -> str:
-    return "infinite" if depth_m is None or not np.isfinite(depth_m) else f"{depth_m:.2f} m"
+    if depth_m is None or not np.isfinite(depth_m):
+        return "infinite"
+    # Beyond, a disparity's error of a hundredth of a pixel changes the depth by a multiple.
+    return f"{depth_m:.2f} m" if depth_m < _FARTHEST_SHOWN_M else f"over {_FARTHEST_SHOWN_M} m"
 
 
 def _describe_pixel(result: Result, point: tuple[int, int]) -> str:
