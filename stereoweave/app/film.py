@@ -178,7 +178,8 @@ def _describe(film: Film, video: "StereoVideo") -> str:
     length_s = float(video.frame_count / video.rate)
     frames = f"{video.frame_count} frames of {width}×{height} px, {length_s:.1f} s"
     packing = f", read as {video.frame_packing.replace('_', ' ')}" if video.frame_packing else ""
-    return f"{OUTPUTS[film.output].label}: {frames}{packing}. {OUTPUTS[film.output].viewing}"
+    silent = "" if film.start_s is None else " A preview has no sound."
+    return f"{OUTPUTS[film.output].label}: {frames}{packing}. {OUTPUTS[film.output].viewing}{silent}"
 
 
 def _describe_problems(tally: "VideoTally") -> list[str]:

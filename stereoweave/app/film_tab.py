@@ -58,8 +58,8 @@ class FilmTab:
         self._start_s = gr.Number(
             0,
             minimum=0,
-            label="Preview from second",
-            info="0: the beginning",
+            label="Begin the preview at second",
+            info="0: the start",
             elem_id="film-start",
         )
         with gr.Accordion("More about the film", open=False):

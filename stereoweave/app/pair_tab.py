@@ -208,6 +208,8 @@ class PairTab:
         """Write the result's files. This takes as long as all previous steps together."""
         if session is None:
             return {self._files: None}
+        if session.is_written:  # a cancelled job is followed by this step, too
+            return {self._files: gr.skip()}
         work = partial(write_all, session.result, session.folder)
         try:
             written = await self._host.work(request, work, progress)
@@ -226,7 +228,7 @@ class PairTab:
         return format_notice([format_summary(session.result.summary), *lines])
 
     def _show_result(self, session: Session, position: float) -> dict[Any, Any]:
-        pair, estimate = session.renderer.pair, session.renderer.estimate
+        pair, estimate = session.pair, session.estimate
         view, where = self._render_view(session, position)
         return {
             self._status: self._format_summary(session),
@@ -270,7 +272,7 @@ class PairTab:
         column, row = event.index
         clicks = [*(clicks if len(clicks) < 2 else []), (int(column), int(row))]
         return (
-            mark_clicks(session.renderer.pair.left, clicks),
+            mark_clicks(session.pair.left, clicks),
             format_paragraphs(measure_clicks(session, clicks)),
             clicks,
         )

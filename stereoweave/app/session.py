@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from stereoweave.app.stereo_pictures import StereoPicture
+from stereoweave.app.stereo_pictures import StereoPicture, crop_both
 from stereoweave.errors import Note, StereoweaveError
 from stereoweave.io.colormap import colour_disparity, find_colour_range_px
 from stereoweave.matching.backend import Backend
@@ -21,7 +21,7 @@ from stereoweave.outputs.results import FILES, needs_camera, write_files
 from stereoweave.outputs.run import Result, run
 from stereoweave.pictures.prepare import Request, prepare
 from stereoweave.rendering.renderer import Renderer
-from stereoweave.stereo import Estimate, StereoCamera
+from stereoweave.stereo import Estimate, StereoCamera, StereoPair
 
 _LONGER_SIDE_PX = 1280
 _MOST_POINTS = 300_000
@@ -36,19 +36,31 @@ _NO_METRES = "For metres, give a calibration file, or the focal length and the b
 
 @dataclass(frozen=True, kw_only=True)
 class Session:
-    """A visitor's latest result, the renderer for its views, and the folder that contains its files.
+    """A visitor's latest result, and the folder that contains its files.
 
-    `stereo_pictures` are the 3-D pictures made so far, by kind.
+    Attributes:
+        result: The result at full size.
+        pair, estimate: Both at the size at which the page shows them.
+        renderer: Renderer of views at that size, without the borders of an aligned pair.
+        folder: Folder of the result's files.
+        stereo_pictures: The 3-D pictures made so far, by kind.
     """
 
     result: Result
+    pair: StereoPair
+    estimate: Estimate
     renderer: Renderer
     folder: Path
     stereo_pictures: dict[str, StereoPicture] = field(default_factory=dict)
 
+    @property
+    def is_written(self) -> bool:
+        """Whether the result's files are written."""
+        return any((self.folder / name).exists() for name in FILES)
+
     def given_px(self, shown_px: tuple[int, int]) -> tuple[int, int]:
         """Convert the column and row of a pixel in the displayed image to those in the full-size image."""
-        given, shown = self.result.pair.left.shape[1::-1], self.renderer.pair.left.shape[1::-1]
+        given, shown = self.result.pair.left.shape[1::-1], self.pair.left.shape[1::-1]
         column, row = (
             round((at + 0.5) * n / m - 0.5) for at, n, m in zip(shown_px, given, shown, strict=True)
         )
@@ -91,8 +103,9 @@ def check_uploads(files: Iterable[Path | None]) -> None:
 
 def open_session(result: Result, folder: Path) -> Session:
     """Return a session for a result, which keeps its files in `folder`."""
-    renderer = Renderer(*downscale(result.pair, result.estimate, _LONGER_SIDE_PX))
-    return Session(result=result, renderer=renderer, folder=folder)
+    pair, estimate = downscale(result.pair, result.estimate, _LONGER_SIDE_PX)
+    renderer = Renderer(*crop_both(pair, estimate))
+    return Session(result=result, pair=pair, estimate=estimate, renderer=renderer, folder=folder)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,7 +167,7 @@ def write_cloud(file: Path, result: Result) -> Path | None:
 
 def colour_depth(session: Session) -> UInt8[np.ndarray, "h w 3"]:
     """Return the disparity as an RGB image [H, W, 3], black outside the left image's content."""
-    disparity_px, seen = session.renderer.estimate.disparity_px, session.renderer.pair.left_seen
+    disparity_px, seen = session.estimate.disparity_px, session.pair.left_seen
     if seen is None:
         return colour_disparity(disparity_px, find_colour_range_px(disparity_px))
     return colour_disparity(disparity_px, find_colour_range_px(disparity_px[seen][None])) * seen[..., None]

@@ -41,39 +41,51 @@ class Kind:
 
 # By the layout's or the animation's name, or a name of our own; MPO and JPS hold layouts of their own.
 KINDS: dict[str, Kind] = {
+    "anaglyph_dubois": Kind(
+        "Anaglyph (red-cyan glasses)",
+        "Look through red-cyan glasses, red on the left eye. The best colours.",
+        ".jpg",
+    ),
+    "wiggle": Kind(
+        "Wiggle (moves by itself)",
+        "Shows depth without glasses, in any program that shows GIF files.",
+        ".gif",
+    ),
     "side_by_side": Kind(
-        "Side by side",
+        "Side by side (VR headset)",
         "For VR headsets, 3-D viewers and parallel viewing: the left eye's view is on the left.",
         ".jpg",
     ),
-    "side_by_side_half": Kind(
-        "Side by side, half width", "For 3-D televisions, which stretch each half to the full width.", ".jpg"
-    ),
     "crossed": Kind(
-        "Crossed", "Cross your eyes until the two pictures become one; no glasses are needed.", ".jpg"
+        "Crossed (without glasses)", "Cross your eyes until the two pictures become one.", ".jpg"
     ),
-    "top_bottom": Kind("Top and bottom", "For VR headsets: the left eye's view is on top.", ".jpg"),
+    "mpo": Kind("MPO (3-D camera)", "The file of 3-D cameras with both views, for 3-D televisions.", ".mpo"),
+    _DEPTH_MAP: Kind("Depth map", "White is near, black is far. For image editors and 3-D photos.", ".png"),
+    "rgbd": Kind(
+        "Picture beside its depth map", "For programs and displays that read colour with depth.", ".jpg"
+    ),
+    "quilt": Kind("Quilt (Looking Glass)", "48 views in one picture, for Looking Glass displays.", ".jpg"),
+    "sweep": Kind("Sweep (moves slowly)", "A smooth ride from the left camera to the right one.", ".webp"),
+    "side_by_side_half": Kind(
+        "Side by side, half width (3-D television)",
+        "The television stretches each half to full width.",
+        ".jpg",
+    ),
+    "top_bottom": Kind(
+        "Top and bottom (VR headset)", "For VR headsets: the left eye's view is on top.", ".jpg"
+    ),
     "top_bottom_half": Kind(
-        "Top and bottom, half height", "For 3-D televisions, which stretch each half to full height.", ".jpg"
-    ),
-    "anaglyph_dubois": Kind(
-        "Anaglyph",
-        "Look through red-cyan glasses, red on the left eye. The best colours.",
+        "Top and bottom, half height (3-D television)",
+        "The television stretches each half to full height.",
         ".jpg",
     ),
     "anaglyph_half_colour": Kind(
         "Anaglyph, half colour", "For red-cyan glasses. Less flicker on red and blue things.", ".jpg"
     ),
     "anaglyph_colour": Kind("Anaglyph, full colour", "For red-cyan glasses. Red things may flicker.", ".jpg"),
-    "anaglyph_grey": Kind("Anaglyph, grey", "For red-cyan glasses, without any colour to disturb.", ".jpg"),
-    "wiggle": Kind("Wiggle", "An animation that shows depth without glasses, in any program.", ".gif"),
-    "sweep": Kind("Sweep", "A slow, smooth ride from the left camera to the right one and back.", ".webp"),
-    "mpo": Kind("MPO", "The file of 3-D cameras, with both views, which 3-D televisions show.", ".mpo"),
-    "jps": Kind("JPS", "A JPEG file with both views, for 3-D picture viewers.", ".jps"),
-    "quilt": Kind("Quilt", "48 views in one picture, for Looking Glass displays.", ".jpg"),
+    "anaglyph_grey": Kind("Anaglyph, grey", "For red-cyan glasses, without colours that flicker.", ".jpg"),
+    "jps": Kind("JPS (3-D viewer)", "A JPEG file with both views, for 3-D picture viewers.", ".jps"),
     "contact_sheet": Kind("Contact sheet", "Nine small views from left to right, to compare them.", ".jpg"),
-    "rgbd": Kind("Picture and depth map", "For programs and displays that read colour with depth.", ".jpg"),
-    _DEPTH_MAP: Kind("Depth map", "White is near, black is far. For image editors and 3-D photos.", ".png"),
 }
 # The layouts that these two file formats hold.
 _HELD = {"mpo": "side_by_side", "jps": "crossed"}
@@ -92,7 +104,7 @@ def write_stereo_picture(
 ) -> StereoPicture:
     """Write one of the `KINDS` and a preview of it to a folder, without the borders of an aligned pair."""
     report(0.1, "preparing")
-    pair, estimate = _crop(pair, estimate)
+    pair, estimate = crop_both(pair, estimate)
     file = folder / f"{'picture' if kind in _HELD else kind}{KINDS[kind].ending}"
     report(0.3, "drawing")
     if kind in ANIMATIONS:
@@ -119,15 +131,19 @@ def _make_renderer(pair: StereoPair, estimate: Estimate, *, converged: bool = Fa
     return Renderer(pair, estimate, convergence_px=median_disparity_px(estimate) if converged else 0.0)
 
 
-def _crop(pair: StereoPair, estimate: Estimate) -> tuple[StereoPair, Estimate]:
-    """Crop a pair and its estimate to the largest rectangle that both pictures cover."""
+def crop_both(pair: StereoPair, estimate: Estimate) -> tuple[StereoPair, Estimate]:
+    """Crop a pair and its estimate to the largest rectangle that both pictures cover; drop the camera.
+
+    Raises:
+        StereoweaveError: No pixel is valid in both pictures.
+    """
     # A camera whose centre is the first pixel tells where the rectangle begins.
     cropped = crop(replace(pair, camera=StereoCamera(focal_px=1, baseline_m=1, cx_px=0, cy_px=0)))
     assert cropped.camera is not None
     top, left = round(-cropped.camera.cy_px), round(-cropped.camera.cx_px)
     height, width = cropped.left.shape[:2]
     part = np.s_[top : top + height, left : left + width]
-    return cropped, Estimate(
+    return replace(cropped, camera=None), Estimate(
         disparity_px=estimate.disparity_px[part],
         right_disparity_px=estimate.right_disparity_px[part],
         confidence=estimate.confidence[part],

@@ -18,10 +18,10 @@ from page_visits import WINDOW, Visit, visiting
 from PIL import Image
 from playwright.sync_api import Browser
 
-from stereoweave.app.session import Uploads, match_uploads, write_cloud, zip_files
+from stereoweave.app.session import Uploads, match_uploads, open_session, write_cloud, zip_files
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.colormap import colour_disparity, find_colour_range_px
-from stereoweave.io.images import read_image
+from stereoweave.io.images import read_image, write_image
 from stereoweave.io.maps import read_pfm
 from stereoweave.matching.backend import Backend
 from stereoweave.outputs.point_cloud import make_point_cloud
@@ -209,6 +209,25 @@ def test_an_expired_upload_is_requested_again(tmp_path):
         r"again$",
     ):
         match_uploads(uploads, lambda share, what: None)
+
+
+def test_views_of_an_aligned_pair_have_no_borders(tmp_path):
+    left, right = (read_image(TEXTURED / f"{side}.png") for side in ("left", "right"))
+    write_image(tmp_path / "left.png", left[30:450, 40:600])
+    write_image(tmp_path / "right.png", right[36:456, 40:600])  # 6 rows lower
+    uploads = Uploads(
+        pictures=(tmp_path / "left.png", tmp_path / "right.png"),
+        request=Request(rectify=True),
+        backend=Backend(),
+    )
+    result = match_uploads(uploads, lambda share, what: None)
+    session = open_session(result, tmp_path)
+    assert result.pair.left_seen is not None
+    assert session.pair.left.shape == result.pair.left.shape == (420, 560, 3)
+    height, width = session.renderer.view(0.5).image.shape[:2]
+    assert 400 < height < 420
+    assert 480 < width <= 560
+    assert session.renderer.pair.left_seen is None
 
 
 def test_large_files_are_not_zipped(tmp_path):

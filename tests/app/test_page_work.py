@@ -1,5 +1,6 @@
 """Long work of the page in Chromium: visitors at once, cancelling, leaving, and 3-D pictures and films."""
 
+import io
 import re
 import time
 from collections.abc import Iterator
@@ -124,6 +125,22 @@ def test_two_visitors_work_at_once_and_cancelling_ends_one_job(server, browser, 
         assert not patient.page.locator("#cancel").is_enabled()
 
 
+def test_after_cancelling_the_result_before_stays(visit, pair, large_pair):
+    visit.give(**pair)
+    visit.find()
+    visit.take_back()
+    visit.give(**large_pair)
+    visit.page.get_by_label("finest").check()
+    visit.page.click("#find")
+    visit.page.locator("#status").get_by_text("matching 2560×1920 px").wait_for()
+    visit.page.click("#cancel")
+    visit.page.locator("#status").get_by_text("Cancelled").wait_for()
+    assert visit.move("0.25").shape == (HEIGHT, WIDTH, 3)
+    visit.open("Files")
+    assert visit.page.locator("#files a").count() > 5
+    assert "Cancelled" in visit.page.locator("#status").inner_text()
+
+
 def test_a_closed_tab_ends_its_film_and_the_next_visitor_s_begins(server, browser, endless_film, tmp_path):
     pid, address = server
     with visiting(browser, address) as leaving:
@@ -196,8 +213,16 @@ def test_each_3_d_picture_opens_with_its_format_and_size(answered, kind, tmp_pat
     assert answered.picture("preview").std() > 10
 
 
+@pytest.mark.parametrize("kind", ["wiggle", "sweep"])
+def test_an_animation_moves_in_its_preview(answered, kind):
+    answered.choose("kind", KINDS[kind].label)
+    answered.page.locator("#picture").get_by_text(f" {kind}").wait_for()
+    with Image.open(io.BytesIO(answered.fetch("preview"))) as preview:
+        assert getattr(preview, "n_frames", 1) == FRAMES[kind]
+
+
 def test_the_halves_of_a_crossed_picture_are_the_right_and_the_left_view(answered, pair, tmp_path):
-    answered.choose("kind", "Crossed")
+    answered.choose("kind", KINDS["crossed"].label)
     answered.page.locator("#picture").get_by_text(" crossed").wait_for()
     crossed = read_image(answered.download("picture", tmp_path)).astype(float)
     for side, half in zip(("right", "left"), np.split(crossed, 2, axis=1), strict=True):

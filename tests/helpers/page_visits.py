@@ -81,13 +81,17 @@ class Visit:
         self.page.locator("#where").get_by_text(re.compile(f"^{re.escape(position)}, ")).wait_for()
         return self.picture("view")
 
-    def picture(self, name: str) -> np.ndarray:
-        """Return the RGB image that a part of the page shows."""
+    def fetch(self, name: str) -> bytes:
+        """Return the bytes of the picture that a part of the page shows."""
         shown = self.page.locator(f"#{name} img")
         shown.wait_for()
         answer = self._context.request.get(shown.get_attribute("src"))
         assert answer.ok, (answer.status, answer.url, answer.text())
-        return np.asarray(Image.open(io.BytesIO(answer.body())).convert("RGB"))
+        return answer.body()
+
+    def picture(self, name: str) -> np.ndarray:
+        """Return the RGB image that a part of the page shows."""
+        return np.asarray(Image.open(io.BytesIO(self.fetch(name))).convert("RGB"))
 
     def close(self) -> None:
         self._context.close()
