@@ -1,6 +1,7 @@
 """Conversion of an uploaded stereo film, or of some seconds of it, without the user interface."""
 
 import io
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -107,14 +108,19 @@ def convert_film(film: Film, folder: Path, report: Callable[[float, str], None])
         from stereoweave.video.reader import open_video
     report(0.0, "opening the film")
     video = open_video(film.files, film.format)
+    whole_count = video.frame_count
     if film.start_s is not None:
         video = video.excerpt(film.start_s, PREVIEW_S)
-    video.on_frame = _FrameReport(video.frame_count, report)
+    video.on_frame = shown = _FrameReport(video.frame_count, report)
     job = VideoJob(**OUTPUTS[film.output].settings, backend=film.backend, name_of=film.name_of)
     console = _NoteConsole()
     out = _name_file(film, video, folder)
     tally = convert_video(video, film.files, out, job, console)
-    return ConvertedFilm(out, _describe(film, video), [*console.lines, *_describe_problems(tally)])
+    summary = _describe(film, video)
+    if film.start_s is not None:
+        whole_s = shown.spent_s / video.frame_count * whole_count
+        summary += f" A preview has no sound. The whole film takes about {_format_duration(whole_s)}."
+    return ConvertedFilm(out, summary, [*console.lines, *_describe_problems(tally)])
 
 
 def _check_container(file: Path) -> None:
@@ -137,16 +143,32 @@ class _FrameReport:
     """Report of the frames read: first those of the survey, then those of the conversion."""
 
     def __init__(self, count: int, report: Callable[[float, str], None]) -> None:
-        self._count, self._report, self._passes = count, report, 0
+        self._count, self._report, self._passes, self._begin_s = count, report, 0, 0.0
 
     def __call__(self, number: int) -> None:
-        self._passes += number == 0
+        if number == 0:
+            self._passes, self._begin_s = self._passes + 1, time.monotonic()
         share = number / self._count
         if self._passes == 1:
             self._report(_SURVEY_SHARE * share, "looking through the film")
-        else:
-            text = f"frame {number + 1} of {self._count}"
-            self._report(_SURVEY_SHARE + (1 - _SURVEY_SHARE) * share, text)
+            return
+        left = number and f", about {_format_duration(self.spent_s / number * (self._count - number))} left"
+        self._report(
+            _SURVEY_SHARE + (1 - _SURVEY_SHARE) * share, f"frame {number + 1} of {self._count}{left or ''}"
+        )
+
+    @property
+    def spent_s(self) -> float:
+        """The time since the conversion began."""
+        return time.monotonic() - self._begin_s
+
+
+def _format_duration(seconds: float) -> str:
+    """Format a duration, rounded as befits an estimate."""
+    if seconds < 90:
+        return f"{max(1, round(seconds))} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 90 else f"{seconds / 3600:.1f} h"
 
 
 class _NoteConsole(Console):
@@ -178,8 +200,7 @@ def _describe(film: Film, video: "StereoVideo") -> str:
     length_s = float(video.frame_count / video.rate)
     frames = f"{video.frame_count} frames of {width}×{height} px, {length_s:.1f} s"
     packing = f", read as {video.frame_packing.replace('_', ' ')}" if video.frame_packing else ""
-    silent = "" if film.start_s is None else " A preview has no sound."
-    return f"{OUTPUTS[film.output].label}: {frames}{packing}. {OUTPUTS[film.output].viewing}{silent}"
+    return f"{OUTPUTS[film.output].label}: {frames}{packing}. {OUTPUTS[film.output].viewing}"
 
 
 def _describe_problems(tally: "VideoTally") -> list[str]:

@@ -93,6 +93,18 @@ def wait_until(condition) -> None:
         time.sleep(0.05)
 
 
+def ask(file: Path, start_s: float | None) -> Film:
+    """Return a visitor's request for the depth of a film."""
+    return Film(
+        files=(file,),
+        format="side_by_side",
+        output="depth",
+        start_s=start_s,
+        backend=Backend(),
+        name_of=label_of,
+    )
+
+
 def begin_endless(visit: Visit, film: Path, pid: int) -> set[int]:
     """Begin to convert a film without end; return the process that does it."""
     visit.open("Film")
@@ -257,6 +269,20 @@ def test_a_file_that_is_no_film_is_one_line(visit, tmp_path):
     assert "/" not in said.inner_text()
 
 
+def test_a_film_s_frames_and_the_time_left_are_reported(tmp_path):
+    film = write_video(tmp_path / "film.mp4", [packed(*pair) for pair in example_pairs(6)])
+    said: list[tuple[float, str]] = []
+    made = convert_film(ask(film, start_s=0.08), tmp_path, lambda share, what: said.append((share, what)))
+    shares, texts = zip(*said, strict=True)
+    assert list(shares) == sorted(shares)
+    assert texts[-4] == "frame 1 of 4"
+    assert re.fullmatch(r"frame 4 of 4, about \d+ (s|min|h) left", texts[-1])
+    assert re.search(
+        r"4 frames of 160×96 px, 0.2 s.*The whole film takes about \d+ (s|min|h)\.", made.summary
+    )
+    assert made.warnings == []
+
+
 @pytest.mark.parametrize("ending", ["m3u8", "mp4", "ffconcat"])
 def test_a_playlist_does_not_read_another_film(tmp_path, ending):
     secret = write_video(tmp_path / "secret.mp4", [packed(*pair) for pair in example_pairs(5)])
@@ -265,16 +291,8 @@ def test_a_playlist_does_not_read_another_film(tmp_path, ending):
         playlist.write_text("ffconcat version 1.0\nfile secret.mp4\n")
     else:
         playlist.write_text(f"#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\n{secret}\n#EXT-X-ENDLIST\n")
-    film = Film(
-        files=(playlist,),
-        format="side_by_side",
-        output="depth",
-        start_s=None,
-        backend=Backend(),
-        name_of=label_of,
-    )
     with pytest.raises(FormatError, match=rf"^playlist\.{ending}: expected a film \(MP4.*found another kind"):
-        convert_film(film, tmp_path, lambda share, what: None)
+        convert_film(ask(playlist, start_s=None), tmp_path, lambda share, what: None)
 
 
 def test_pictures_that_do_not_fit_get_a_banner(visit, tmp_path):
