@@ -35,6 +35,7 @@ from stereoweave.app.session import (
 from stereoweave.app.stereo_picture_tab import StereoPictureTab
 from stereoweave.errors import Note, StereoweaveError
 from stereoweave.io.colormap import OCCLUDED_RGB, colour_confidence, css_colour, legend_colours
+from stereoweave.outputs.run import Result
 
 _EMPTY = """<div class="empty"><ol>
 <li>Drop the left and the right picture, or one file that holds both:
@@ -187,9 +188,8 @@ class PairTab:
             uploads = self._form.read(given, self._host.provider)
             result = await self._host.work(request, partial(match_uploads, uploads), progress)
             progress(0.6, desc="showing")
-            folder = Path(tempfile.mkdtemp(dir=self._host.folder))
-            session = await asyncio.to_thread(open_session, result, folder)
-            shown = self._show_result(session, given[self._position])
+            # Otherwise, all other visitors would wait.
+            shown = await asyncio.to_thread(self._open_result, result, given[self._position])
         except (StereoweaveError, OSError) as error:
             shown = {
                 self._status: self._wording.format_error(error),
@@ -226,6 +226,10 @@ class PairTab:
     def _format_summary(self, session: Session, notes: Sequence[Note] = ()) -> str:
         lines = self._wording.format_notes([*session.result.notes, *notes])
         return format_notice([format_summary(session.result.summary), *lines])
+
+    def _open_result(self, result: Result, position: float) -> dict[Any, Any]:
+        folder = Path(tempfile.mkdtemp(dir=self._host.folder))
+        return self._show_result(open_session(result, folder), position)
 
     def _show_result(self, session: Session, position: float) -> dict[Any, Any]:
         pair, estimate = session.pair, session.estimate

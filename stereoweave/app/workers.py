@@ -77,8 +77,8 @@ class Workers:
 
     def stop(self, visitor: str) -> None:
         """Stop all work of a visitor."""
-        for process, worker_of in self._busy.items():
-            if worker_of == visitor:
+        for process, owner in list(self._busy.items()):  # another thread may change it
+            if owner == visitor:
                 process.kill()
 
     @contextmanager
