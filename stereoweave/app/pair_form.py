@@ -44,7 +44,7 @@ class PairForm:
             MODELS,
             value="small",
             label=_LABELS["model"],
-            info="Finer takes longer: fine 2 times, finest 10 times.",
+            info="Finer takes longer: fine 2 times, finest 5 times.",
             elem_id="model",
         )
         with gr.Accordion("More about the pictures", open=False):
