@@ -9,7 +9,7 @@ import pytest
 import typer
 
 import stereoweave as sw
-from stereoweave.app.page import label_of
+from stereoweave.app.pair_form import label_of
 from stereoweave.cli.commands import option_names
 from stereoweave.cli.root import app
 from stereoweave.service.answers import field_name

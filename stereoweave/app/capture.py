@@ -3,6 +3,7 @@
 import threading
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from itertools import count
 from pathlib import Path
 from types import TracebackType
@@ -40,23 +41,26 @@ class Capture:
     Args:
         sources: One source with both views, or a left and a right source. Each is a camera number, a video
             file, a stream address, or a series of pictures such as frame%03d.png.
+        loop: Begin a video file or a series of pictures again at its end. Cameras and streams have no end.
 
     Raises:
         FormatError: If a source cannot be opened.
         StereoweaveError: If there are more than two sources.
     """
 
-    def __init__(self, sources: Sequence[str]) -> None:
+    def __init__(self, sources: Sequence[str], *, loop: bool = False) -> None:
         if len(sources) > 2:
             raise StereoweaveError(
                 f"expected one source with both views, or a left and a right source, found {len(sources)}: "
                 f"{' '.join(sources)}"
             )
         self.name, self.count = " and ".join(sources), len(sources)
+        self._sources = sources
         self._captures = [_open_source(source) for source in sources]
         first = self._captures[0]
         # A single picture or a recorded stream has no frame count.
         self._is_recording = first.get(cv2.CAP_PROP_FRAME_COUNT) > 0 or Path(sources[0]).is_file()
+        self._loop = loop and self._is_recording
         rate = first.get(cv2.CAP_PROP_FPS)
         self._step_s = 1 / (rate if rate > 0 else _DEFAULT_RATE)
         self._newest: Moment | None = None
@@ -99,6 +103,9 @@ class Capture:
         try:
             for number in count():
                 pictures = self._read()
+                if pictures is None and self._loop and number:
+                    self._rewind()
+                    pictures = self._read()
                 early_s = begin_s + number * self._step_s - time.monotonic() if self._is_recording else 0
                 if pictures is None or self._stopped.wait(max(early_s, 0)):
                     return
@@ -106,11 +113,20 @@ class Capture:
                     self._newest = Moment(number, pictures, time.monotonic())
                     self._changed.notify_all()
         finally:
-            for capture in self._captures:
-                capture.release()
+            self._release()
             with self._changed:
                 self._ended = True
                 self._changed.notify_all()
+
+    def _rewind(self) -> None:
+        """Begin again. The files are opened anew, because a series of pictures cannot be wound back."""
+        self._release()
+        with suppress(FormatError):  # a file that is gone ends the video
+            self._captures = [_open_source(source) for source in self._sources]
+
+    def _release(self) -> None:
+        for capture in self._captures:
+            capture.release()
 
     def _read(self) -> tuple[Picture, ...] | None:
         # Grab all images before decoding any, so that they are as close in time as possible.

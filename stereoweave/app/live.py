@@ -24,6 +24,9 @@ _RANGE_SHARE = 0.1
 _RANGE_STEP_PX = 4
 _RATE_FRAMES = 30
 _STRIP_PX, _FONT, _FONT_SCALE = 32, cv2.FONT_HERSHEY_SIMPLEX, 0.6
+_LEGEND_PX, _RAMP_END_PX, _LABELS = 40, 18, 4
+# The depth of the middle is the median of a square that reaches this far to each side.
+_MIDDLE_PX = 4
 
 
 @dataclass
@@ -87,7 +90,7 @@ def show(  # noqa: PLR0913 - source, output and settings
         disparity_px = match(matcher, pair).disparity_px
         range_px = follow_range(range_px, disparity_px)
         tally.add(moment, time.monotonic())
-        status = f"{tally.rate:.1f} frames/s, {1000 * (tally.last_s[-1] - moment.taken_s):.0f} ms"
+        status = f"{tally.rate:.1f} frames/s, {1000 * (tally.last_s[-1] - moment.taken_s):.0f} ms behind"
         screen.show(compose(pair, disparity_px, range_px, status))
 
 
@@ -105,24 +108,72 @@ def follow_range(
 def compose(
     pair: StereoPair, disparity_px: Float[np.ndarray, "h w"], range_px: tuple[float, float], status: str
 ) -> Frame:
-    """Draw the left image and its disparity side by side, with a line of text above."""
+    """Draw the left image and its disparity side by side, a line of text above, and a legend below.
+
+    A cross marks the middle of both, whose depth or disparity is part of the text.
+    """
     colours = colour_disparity(disparity_px, range_px)
     if pair.left_seen is not None:
         colours[~pair.left_seen] = 0
-    both = np.hstack([pair.left, colours])
-    text = f"{status}; {describe_range(pair.camera, range_px)}"
-    (width_px, _), _ = cv2.getTextSize(text, _FONT, _FONT_SCALE, 1)
-    scale = _FONT_SCALE * min(1.0, both.shape[1] / (width_px + _STRIP_PX))
+    both = np.hstack([_mark_middle(pair.left), _mark_middle(colours)])
     picture = cv2.copyMakeBorder(both, _STRIP_PX, 0, 0, 0, cv2.BORDER_CONSTANT)
-    return cv2.putText(picture, text, (8, 22), _FONT, scale, (255, 255, 255), 1, cv2.LINE_AA)
+    _write(
+        picture, f"{status}; middle: {describe_middle(pair, disparity_px)}", (8, 22), picture.shape[1] - 16
+    )
+    return np.vstack([picture, _draw_legend(pair.camera, range_px, both.shape[1])])
 
 
-def describe_range(camera: StereoCamera | None, range_px: tuple[float, float]) -> str:
-    """Return a legend for the first and last colours, in metres if the camera is known, else in pixels."""
+def describe_middle(pair: StereoPair, disparity_px: Float[np.ndarray, "h w"]) -> str:
+    """Return the depth around the middle of the left image, or the disparity if the camera is unknown."""
+    height, width = disparity_px.shape
+    rows, columns = (
+        slice(max(0, side // 2 - _MIDDLE_PX), side // 2 + _MIDDLE_PX + 1) for side in (height, width)
+    )
+    [text] = label_values(pair.camera, [float(np.median(disparity_px[rows, columns]))])
+    return text
+
+
+def label_values(camera: StereoCamera | None, disparities_px: Sequence[float]) -> list[str]:
+    """Return each disparity as a depth in metres, or in pixels if the camera is unknown."""
     if camera is None:
-        return "disparity {:.1f} px (blue) to {:.1f} px (red)".format(*range_px)
-    far_m, near_m = camera.depth_m(np.array([range_px]))[0]
-    return f"depth {far_m:.2f} m (blue) to {near_m:.2f} m (red)"
+        return [f"{disparity_px:.1f} px" for disparity_px in disparities_px]
+    depths_m = camera.depth_m(np.array([disparities_px]))[0]
+    return [f"{depth_m:.2f} m" if np.isfinite(depth_m) else "infinite" for depth_m in depths_m]
+
+
+def _draw_legend(camera: StereoCamera | None, range_px: tuple[float, float], width_px: int) -> Frame:
+    """Draw the colours from the farthest to the nearest, with values in metres or pixels below them."""
+    ramp = colour_disparity(np.linspace(*range_px, width_px, dtype=np.float32)[None], range_px)
+    legend = np.zeros((_LEGEND_PX, width_px, 3), np.uint8)
+    legend[4:_RAMP_END_PX] = ramp
+    labels = label_values(camera, np.linspace(*range_px, _LABELS).tolist())
+    labels[0], labels[-1] = f"far {labels[0]}", f"near {labels[-1]}"
+    room_px = width_px // _LABELS - 8
+    for index, label in enumerate(labels):
+        share = index / (_LABELS - 1)
+        text_px = min(room_px, _measure_text_px(label))
+        left_px = round(4 + share * (width_px - 8 - text_px))
+        _write(legend, label, (left_px, _LEGEND_PX - 6), room_px)
+    return legend
+
+
+def _mark_middle(image: Frame) -> Frame:
+    """Return the image with a white cross in its middle, which has a black border."""
+    marked, middle = image.copy(), (image.shape[1] // 2, image.shape[0] // 2)
+    for colour, thickness_px in (((0, 0, 0), 3), ((255, 255, 255), 1)):
+        cv2.drawMarker(marked, middle, colour, cv2.MARKER_CROSS, 2 * _MIDDLE_PX + 5, thickness_px)
+    return marked
+
+
+def _write(picture: Frame, text: str, place: tuple[int, int], room_px: int) -> None:
+    """Write white text into a picture, small enough to take at most `room_px`."""
+    scale = _FONT_SCALE * min(1.0, room_px / _measure_text_px(text))
+    cv2.putText(picture, text, place, _FONT, scale, (255, 255, 255), 1, cv2.LINE_AA)
+
+
+def _measure_text_px(text: str) -> int:
+    (width_px, _), _ = cv2.getTextSize(text, _FONT, _FONT_SCALE, 1)
+    return width_px
 
 
 def _split_pair(pictures: Sequence[Picture], format: str | None) -> StereoPair:

@@ -33,6 +33,7 @@ _PAGE = b"""<!doctype html>
 </html>
 """
 _JPEG_QUALITY = 85
+_REPEAT_S = 0.5
 
 
 class Screen(ThreadingHTTPServer):
@@ -83,13 +84,20 @@ class Screen(ThreadingHTTPServer):
             self._changed.notify_all()
 
     def pictures(self) -> Iterator[bytes]:
-        """Yield each new image as JPEG, beginning with the current one; skip images that arrive too fast."""
-        shown = 0
+        """Yield each new image as JPEG, beginning with the current one; skip images that arrive too fast.
+
+        If no other one follows, an image is yielded twice: Chromium shows an image only when the next one
+        arrives.
+        """
+        shown, is_repeated = 0, True
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._closed or self._number > shown)  # noqa: B023 - called at once
-                if self._number == shown:
+                wait_s = None if is_repeated else _REPEAT_S
+                # The lambda is called at once.
+                self._changed.wait_for(lambda: self._closed or self._number > shown, wait_s)  # noqa: B023
+                if self._closed and self._number == shown:
                     return
+                is_repeated = self._number == shown
                 jpeg, shown = self._jpeg, self._number
             yield jpeg
 

@@ -16,26 +16,30 @@ from fastapi import FastAPI
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 
 from stereoweave.app.access import ContentPolicy, OwnFiles
-from stereoweave.app.page import Page, sample_folder
+from stereoweave.app.events import Host
+from stereoweave.app.page import make_page
+from stereoweave.app.pair_form import sample_folder
+from stereoweave.app.workers import Workers
 from stereoweave.matching.providers import CPU
 
 _MOST_BYTES = 200 * 1024**2
+# Gradio applies our style sheet only inside this margin.
+_NARROW = "<style>@media (max-width: 640px) { .gradio-container .main { padding: 1rem !important } }</style>"
 
 
-def make_server(folder: Path, names: Sequence[str] | None, provider: str = CPU) -> FastAPI:
+def make_server(host: Host, names: Sequence[str] | None) -> FastAPI:
     """Make the page's ASGI application.
 
     Args:
-        folder: Folder for uploads and results.
+        host: Folder for uploads and results, processes for the work, and provider.
         names: Allowed values of the Host header; None allows all values.
-        provider: Hardware that runs the network.
     """
-    os.environ["GRADIO_TEMP_DIR"] = str(folder)
+    os.environ["GRADIO_TEMP_DIR"] = str(host.folder)
     server = FastAPI(openapi_url=None)
     css = importlib.resources.files("stereoweave.app").joinpath("page.css").read_text(encoding="utf-8")
     gr.mount_gradio_app(
         server,
-        Page(folder, provider).blocks,
+        make_page(host),
         path="/",
         footer_links=[],
         run_history=False,
@@ -47,6 +51,7 @@ def make_server(folder: Path, names: Sequence[str] | None, provider: str = CPU) 
         mcp_server=False,
         theme=_make_theme(),
         css=css,
+        head=_NARROW,
     )
     server.add_middleware(OwnFiles)
     if names is not None:
@@ -78,9 +83,12 @@ def serve(
         provider: Hardware that runs the network.
     """
     _handle_signals()
-    with tempfile.TemporaryDirectory(prefix="stereoweave-page-") as folder:
+    with (
+        tempfile.TemporaryDirectory(prefix="stereoweave-page-") as folder,
+        Workers(Path(folder) / "workers") as workers,
+    ):
+        server = make_server(Host(Path(folder), workers, provider), names)
         # An open page keeps its connection open, so the shutdown has a time limit.
-        server = make_server(Path(folder), names, provider)
         config = uvicorn.Config(server, log_level="critical", timeout_graceful_shutdown=1)
         if browsed:
             webbrowser.open(browsed)

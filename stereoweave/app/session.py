@@ -1,14 +1,15 @@
 """Matching, drawing, measurement and output for a visitor to the web page, without the user interface."""
 
 import zipfile
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from stereoweave.app.stereo_pictures import StereoPicture, crop_both
 from stereoweave.errors import Note, StereoweaveError
 from stereoweave.io.colormap import colour_disparity, find_colour_range_px
 from stereoweave.matching.backend import Backend
@@ -20,7 +21,7 @@ from stereoweave.outputs.results import FILES, needs_camera, write_files
 from stereoweave.outputs.run import Result, run
 from stereoweave.pictures.prepare import Request, prepare
 from stereoweave.rendering.renderer import Renderer
-from stereoweave.stereo import Estimate, StereoCamera
+from stereoweave.stereo import Estimate, StereoCamera, StereoPair
 
 _LONGER_SIDE_PX = 1280
 _MOST_POINTS = 300_000
@@ -29,20 +30,37 @@ _MOST_POINTS = 300_000
 _FARTHEST = 4.0
 # Files up to this total size, reached at about 8 megapixels, are stored twice: individually and in the zip.
 _MOST_ZIPPED_BYTES = 300 * 1024**2
+_FARTHEST_SHOWN_M = 1000
 _NO_METRES = "For metres, give a calibration file, or the focal length and the baseline."
 
 
 @dataclass(frozen=True, kw_only=True)
 class Session:
-    """A visitor's latest result, the renderer for its views, and the folder that contains its files."""
+    """A visitor's latest result, and the folder that contains its files.
+
+    Attributes:
+        result: The result at full size.
+        pair, estimate: Both at the size at which the page shows them.
+        renderer: Renderer of views at that size, without the borders of an aligned pair.
+        folder: Folder of the result's files.
+        stereo_pictures: The 3-D pictures made so far, by kind.
+    """
 
     result: Result
+    pair: StereoPair
+    estimate: Estimate
     renderer: Renderer
     folder: Path
+    stereo_pictures: dict[str, StereoPicture] = field(default_factory=dict)
+
+    @property
+    def is_written(self) -> bool:
+        """Whether the result's files are written."""
+        return any((self.folder / name).exists() for name in FILES)
 
     def given_px(self, shown_px: tuple[int, int]) -> tuple[int, int]:
         """Convert the column and row of a pixel in the displayed image to those in the full-size image."""
-        given, shown = self.result.pair.left.shape[1::-1], self.renderer.pair.left.shape[1::-1]
+        given, shown = self.result.pair.left.shape[1::-1], self.pair.left.shape[1::-1]
         column, row = (
             round((at + 0.5) * n / m - 0.5) for at, n, m in zip(shown_px, given, shown, strict=True)
         )
@@ -58,39 +76,65 @@ class Uploads:
     backend: Backend
 
 
-def match_uploads(uploads: Uploads, folder: Path, report_progress: Callable[[float, str], None]) -> Session:
-    """Match uploaded pictures, and return a session that keeps its files in `folder`.
+def match_uploads(uploads: Uploads, report_progress: Callable[[float, str], None]) -> Result:
+    """Match uploaded pictures.
 
     `report_progress` is called with the completed fraction, from 0 to 1, and the name of the next step.
     """
     if not uploads.pictures:
         raise StereoweaveError("expected a left and a right picture, or one file with both views, found none")
-    for file in (*uploads.pictures, uploads.request.calibration):
+    check_uploads([*uploads.pictures, uploads.request.calibration])
+    report_progress(0.1, "reading")
+    prepared = prepare(uploads.pictures, uploads.request)
+    height, width = prepared.pair.left.shape[:2]
+    report_progress(0.3, f"matching {width}×{height} px")
+    return run(prepared, uploads.backend.matcher(), MatchOptions(refined=True))
+
+
+def check_uploads(files: Iterable[Path | None]) -> None:
+    """Raise a StereoweaveError if the page has already removed an uploaded file."""
+    for file in files:
         if file and not file.exists():
             raise StereoweaveError(
                 f"{file.name}: expected an upload from the last hour, found an expired one; "
                 "upload the file again"
             )
-    report_progress(0.1, "reading")
-    prepared = prepare(uploads.pictures, uploads.request)
-    height, width = prepared.pair.left.shape[:2]
-    report_progress(0.3, f"matching {width}×{height} px")
-    result = run(prepared, uploads.backend.matcher(), MatchOptions(refined=True))
-    report_progress(0.6, "showing")
-    renderer = Renderer(*downscale(result.pair, result.estimate, _LONGER_SIDE_PX))
-    return Session(result=result, renderer=renderer, folder=folder)
 
 
-def write_all(session: Session) -> tuple[list[Path], list[Note]]:
-    """Write the result's files in all formats.
+def open_session(result: Result, folder: Path) -> Session:
+    """Return a session for a result, which keeps its files in `folder`."""
+    pair, estimate = downscale(result.pair, result.estimate, _LONGER_SIDE_PX)
+    renderer = Renderer(*crop_both(pair, estimate))
+    return Session(result=result, pair=pair, estimate=estimate, renderer=renderer, folder=folder)
 
-    Returns:
-        The files, and notes on skipped files and on likely defects of the pair.
+
+@dataclass(frozen=True, kw_only=True)
+class Written:
+    """A result's files in all formats, an archive of them, and what the user should know.
+
+    Attributes:
+        files: The files.
+        archive: The archive; None if the files are too large to be stored twice.
+        notes: Notes on skipped files.
+        warnings: Notes on likely defects of the pair.
     """
-    result = session.result
+
+    files: list[Path]
+    archive: Path | None
+    notes: list[Note]
+    warnings: list[Note]
+
+
+def write_all(result: Result, folder: Path, report_progress: Callable[[float, str], None]) -> Written:
+    """Write the result's files in all formats, and check the pair."""
+    report_progress(0.7, "checking the pictures")
+    warnings = result.warnings()
+    report_progress(0.8, "writing the files")
     names = [name for name in FILES if result.pair.camera or not needs_camera(name)]
-    notes = write_files(session.folder, names, result) + result.warnings()
-    return [file for file in map(session.folder.joinpath, names) if file.exists()], notes
+    notes = write_files(folder, names, result)
+    files = [file for file in map(folder.joinpath, names) if file.exists()]
+    archive = zip_files(folder / "stereoweave.zip", files)
+    return Written(files=files, archive=archive, notes=notes, warnings=warnings)
 
 
 def zip_files(file: Path, files: Sequence[Path]) -> Path | None:
@@ -123,7 +167,7 @@ def write_cloud(file: Path, result: Result) -> Path | None:
 
 def colour_depth(session: Session) -> UInt8[np.ndarray, "h w 3"]:
     """Return the disparity as an RGB image [H, W, 3], black outside the left image's content."""
-    disparity_px, seen = session.renderer.estimate.disparity_px, session.renderer.pair.left_seen
+    disparity_px, seen = session.estimate.disparity_px, session.pair.left_seen
     if seen is None:
         return colour_disparity(disparity_px, find_colour_range_px(disparity_px))
     return colour_disparity(disparity_px, find_colour_range_px(disparity_px[seen][None])) * seen[..., None]
@@ -177,7 +221,10 @@ def format_summary(summary: Summary) -> str:
 
 
 def _format_metres(depth_m: float | None) -> str:
-    return "infinite" if depth_m is None or not np.isfinite(depth_m) else f"{depth_m:.2f} m"
+    if depth_m is None or not np.isfinite(depth_m):
+        return "infinite"
+    # Beyond, a disparity's error of a hundredth of a pixel changes the depth by a multiple.
+    return f"{depth_m:.2f} m" if depth_m < _FARTHEST_SHOWN_M else f"over {_FARTHEST_SHOWN_M} m"
 
 
 def _describe_pixel(result: Result, point: tuple[int, int]) -> str:

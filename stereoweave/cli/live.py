@@ -1,6 +1,7 @@
 """The command `stereoweave live`."""
 
 import os
+import time
 import webbrowser
 from contextlib import suppress
 from pathlib import Path
@@ -34,6 +35,7 @@ Calib = Annotated[
 Port = Annotated[
     int, typer.Option(min=0, max=65535, help="Port of the page, on this machine only; 0 takes any free port.")
 ]
+Loop = Annotated[bool, typer.Option("--loop", help="Begin a video file again at its end.")]
 Browser = Annotated[bool, typer.Option(help="Open the page in the browser.")]
 
 
@@ -46,9 +48,13 @@ def live(  # noqa: PLR0913 - each is an option of the command line
     provider: Provider = "cpu",
     port: Port = 8123,
     browser: Browser = True,
+    loop: Loop = False,
     arrangement: OldFormat = None,
 ) -> None:
-    """Show live video and its depth in colour on a web page. Ctrl-C stops it."""
+    """Show live video and its depth in colour on a web page. Ctrl-C stops it.
+
+    At the end of a video file, its last picture stays on the page.
+    """
     # Otherwise, FFmpeg would print its own message in addition to our error.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     from stereoweave.app.capture import Capture
@@ -67,12 +73,15 @@ def live(  # noqa: PLR0913 - each is an option of the command line
         )
     rig = read_rig(calib) if calib else None
     matcher, tally = Backend(model=model, threads=threads, provider=provider).matcher(), LiveTally()
-    with Screen(port) as screen, Capture(sources) as capture:
+    with Screen(port) as screen, Capture(sources, loop=loop) as capture:
         typer.echo(f"{capture.name}: shown at {screen.url}; Ctrl-C stops it")
         if browser:
             webbrowser.open(screen.url)
-        try:
-            with suppress(KeyboardInterrupt):
+        with suppress(KeyboardInterrupt):
+            try:
                 show(capture, screen, matcher, tally, format=format, rig=rig)
-        finally:
-            typer.echo(f"{capture.name}: {tally.describe()}")
+            finally:
+                typer.echo(f"{capture.name}: {tally.describe()}")
+            typer.echo("end of the video; its last picture stays on the page until Ctrl-C")
+            while True:
+                time.sleep(3600)

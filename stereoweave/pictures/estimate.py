@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
+from stereoweave.arguments import describe
 from stereoweave.cameras import auto_align
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.arrays import ImageLike, as_rgb
@@ -49,7 +50,7 @@ def estimate(  # noqa: PLR0913 - all but the images are keyword-only and optiona
             that fails, and StereoweaveError for invalid images or options.
     """
     if align is not None and not (isinstance(align, str) and align == "auto"):
-        raise StereoweaveError(f"expected 'auto' or None, got {align!r}", setting="align")
+        raise StereoweaveError(f"expected 'auto' or None, got {describe(align)}", setting="align")
     options = MatchOptions(range_px=range_px, refined=refined, raw=raw)
     given = StereoPair(left=as_rgb(left, "left"), right=as_rgb(right, "right"))
     matcher = Backend(model=model, threads=threads, provider=provider).matcher()

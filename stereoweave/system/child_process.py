@@ -68,6 +68,16 @@ class ChildProcess:
         """The process ID of the child."""
         return self._process.pid
 
+    @property
+    def has_ended(self) -> bool:
+        """Whether the process was killed or crashed while no call was under way."""
+        return self._process.poll() is not None
+
+    def kill(self) -> None:
+        """Kill the process. A call that is under way replaces it and raises ProcessDiedError."""
+        self._process.kill()
+        self._process.wait()
+
     def close(self) -> None:
         """Stop the child process."""
         self._end()

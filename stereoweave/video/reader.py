@@ -1,6 +1,8 @@
 """Reading of stereo videos as timed pairs of frames, for all supported frame packings."""
 
-from collections.abc import Iterator, Sequence
+import copy
+import math
+from collections.abc import Callable, Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import NamedTuple
@@ -48,6 +50,7 @@ class StereoVideo:
         rate: Average frames per second.
         time_base: Time unit in seconds; every frame time is a multiple of this unit.
         sound: File that contains the sound; None for a silent video.
+        on_frame: Function that `frames` calls with the number of each frame that it yields, to show progress.
     """
 
     def __init__(self, tracks: Sequence[Track], frame_packing: str | None) -> None:
@@ -61,6 +64,26 @@ class StereoVideo:
         self.frame_count = min(len(track.steps) for track in tracks)
         self.rate, self.time_base = first.rate, first.time_base
         self.sound = next((track.sound for track in tracks if track.sound), None)
+        self.on_frame: Callable[[int], None] = lambda number: None
+        self._first, self._last = 0, self.frame_count - 1
+
+    def excerpt(self, start_s: float, length_s: float) -> "StereoVideo":
+        """Return a part of the video as a silent video of its own, whose times and numbers begin at 0.
+
+        Raises:
+            StereoweaveError: The video ends before the part begins.
+        """
+        first = math.ceil(start_s * self.rate)
+        if not 0 <= first < self.frame_count:
+            length = format_time(self.frame_count / self.rate)
+            raise StereoweaveError(
+                f"expected a start within the video of {length}, found {start_s:g} s; choose an earlier one"
+            )
+        part = copy.copy(self)
+        part._first = self._first + first
+        part.frame_count = min(math.ceil(length_s * self.rate), self.frame_count - first)
+        part.sound = None
+        return part
 
     def frames(self, start: int = 0) -> Iterator[StereoFrame]:
         """Yield the frames from number `start` on, the same as if reading had begun at the first frame.
@@ -69,12 +92,13 @@ class StereoVideo:
         missing frame, up to the next key frame, are yielded as decoded. In both cases, the frame's `problem`
         says so.
         """
-        steps = self._tracks[0].steps
-        every_track = zip(*(_bridge_gaps(track, start) for track in self._tracks), strict=False)
-        for index, seen in zip(range(start, self.frame_count), every_track, strict=False):
+        steps, first = self._tracks[0].steps, self._first
+        every_track = zip(*(_bridge_gaps(track, first + start) for track in self._tracks), strict=False)
+        for index, seen in zip(range(first + start, first + self.frame_count), every_track, strict=False):
             pictures = [shot.picture() for shot, _ in seen]
             left, right = self._split.eyes(*pictures) if self._split else pictures
-            time = (steps[index] - steps[0]) * self.time_base
+            time = (steps[index] - steps[first]) * self.time_base
+            self.on_frame(index - first)
             yield StereoFrame(
                 left, right, time, self._describe_problem(index, [problem for _, problem in seen])
             )
@@ -87,12 +111,12 @@ class StereoVideo:
             if problem
         ]
         found += [_RETIMED] if index in self._tracks[0].retimed else []
-        if index == self.frame_count - 1:
+        if index == self._last:
             found += [ending for track in self._tracks if (ending := self._describe_ending(track))]
         return "; ".join(found) or None
 
     def _describe_ending(self, track: Track) -> str | None:
-        more = len(track.steps) - self.frame_count
+        more = len(track.steps) - (self._last + 1)
         frames = "1 more frame" if more == 1 else f"{more} more frames"
         return f"{track.name} has {frames} than the other video" if more else track.truncation
 

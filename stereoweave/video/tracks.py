@@ -28,6 +28,8 @@ _HD_WIDTH_PX, _HD_HEIGHT_PX = 1280, 577
 _BT709, _BT601, _FULL_RANGE = 1, 5, 2  # av.video.reformatter's Colorspace and ColorRange
 _UNTAGGED = 0, 2  # AVCOL_SPC_RGB, which some encoders write for "unknown", and AVCOL_SPC_UNSPECIFIED
 
+# FFmpeg's AV_FRAME_DATA_VIEW_ID.
+_VIEW_ID = 29
 # AVStereo3D begins with its type and its flags. The type is one of these, 0 (not stereo) or 8 (unknown). The
 # lowest flag means that the right eye comes first.
 _STEREO_3D = {
@@ -94,7 +96,7 @@ class VideoTrack:
                 raise FormatError(f"{path}: expected a video, found a file without a decodable frame")
             self._frame_size_px = first.width, first.height
             self.size_px = self._frame_size_px if first.rotation % 180 == 0 else self._frame_size_px[::-1]
-            self.declared_packing = _read_declared_packing(first)
+            self.declared_packing = _read_declared_packing(path, first)
 
     def shots(self, start: int) -> Iterator[Shot]:
         """Yield the frames that can be decoded, in display order, always beginning with the first frame.
@@ -396,11 +398,19 @@ def _convert_to_rgb(frame: "av.VideoFrame") -> UInt8[np.ndarray, "h w 3"]:
     return np.ascontiguousarray(np.rot90(picture, frame.rotation // 90))
 
 
-def _read_declared_packing(frame: "av.VideoFrame") -> str | None:
+def _read_declared_packing(path: Path, frame: "av.VideoFrame") -> str | None:
     from av.sidedata.sidedata import Type
 
     # The type stubs of PyAV lack some kinds of side data.
-    side_data: Any = frame.side_data
+    try:
+        side_data: Any = frame.side_data
+    except ValueError as error:  # a kind of side data that PyAV does not know
+        if str(error).startswith(f"{_VIEW_ID} "):
+            raise FormatError(
+                f"{path}: expected both views in each frame, or two files, found a video with one view per "
+                "layer (MV-HEVC, as in Apple's spatial videos); convert it to side by side first"
+            ) from error
+        return None
     if Type.STEREO3D not in side_data:
         return None
     kind, flags = np.frombuffer(bytes(side_data[Type.STEREO3D]), np.int32, 2)

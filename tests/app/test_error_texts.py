@@ -22,7 +22,7 @@ ERRORS: dict[str, tuple[dict[str, str], dict[str, Any]]] = {
     "“Layout of a single file”: expected one picture that holds both views, found two, left.png and "
     "right.png; omit this setting, and give the left picture first": (PAIR, {"layout": "crossed"}),
     "turned.yml: expected a calibration of rectified pictures, found lenses with distortion; rectify the "
-    "pair with it (“Rectify the pair”)": ({**PAIR, "calibration": "turned.yml"}, {}),
+    "pair with it (“Align the pictures”)": ({**PAIR, "calibration": "turned.yml"}, {}),
     "metres: expected a baseline besides the focal length, found none in EXIF; give the baseline "
     "(“Baseline, mm”)": (
         PAIR,
@@ -30,7 +30,7 @@ ERRORS: dict[str, tuple[dict[str, str], dict[str, Any]]] = {
     ),
     "metres: expected a focal length besides the baseline, found none in EXIF; give the focal length "
     "(“Focal length, px”)": (PAIR, {"baseline": 100}),
-    "“Rectify the pair”: expected at least 40 feature matches that agree on the camera positions, "
+    "“Align the pictures”: expected at least 40 feature matches that agree on the camera positions, "
     "found 0 of 0 matches; photograph a scene with more texture and with more overlap; or give a "
     "calibration (“Calibration file, for metres”)": (
         {"left": "plain.png", "right": "plain.png"},

@@ -11,9 +11,10 @@ from urllib.parse import urlsplit
 import cv2
 import numpy as np
 import pytest
+from browsers import chromium
 
 from stereoweave.app.capture import Capture
-from stereoweave.app.live import LiveTally, compose, describe_range, follow_range, show
+from stereoweave.app.live import LiveTally, compose, describe_middle, follow_range, label_values, show
 from stereoweave.app.screen import Screen
 from stereoweave.cameras.calibration_files import read_rig
 from stereoweave.cli.live import live
@@ -191,9 +192,26 @@ def test_the_page_shows_a_stream_of_the_newest_images():
         stream = read_pictures(request(screen.url, "/stream"))
         assert number_of(next(stream)) == 7
         screen.show(first)
-        assert number_of(next(stream)) == 3
+        # An image is sent again if no other one follows.
+        assert next(number for picture in stream if (number := number_of(picture)) != 7) == 3
         screen.close()
-        assert list(stream) == []
+        assert {number_of(picture) for picture in stream} <= {3}
+
+
+@pytest.mark.system
+@pytest.mark.needs_chromium
+def test_a_browser_shows_a_single_image():
+    with Screen(0) as screen, chromium() as browser:
+        screen.show(np.full((64, 96, 3), 200, np.uint8))
+        page = browser.new_page()
+        page.goto(screen.url, wait_until="commit")  # the stream, and thus the page, is never complete
+        for _ in range(100):
+            shown = cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), cv2.IMREAD_COLOR)
+            if shown.mean() > 100:
+                break
+            page.wait_for_timeout(100)
+        assert abs(int(shown[shown.shape[0] // 2, shown.shape[1] // 2, 0]) - 200) < 5
+        screen.close()
 
 
 def test_the_page_is_available_on_this_machine_only():
@@ -226,17 +244,67 @@ def test_the_disparity_is_beside_the_left_image_and_black_where_nothing_is_seen(
     disparity_px = rng.uniform(0, 9, (40, 60)).astype(np.float32)
     pair = StereoPair(left=left, right=left, left_seen=seen)
     picture = compose(pair, disparity_px, (0, 9), "12.0 frames/s")
-    strip, below = picture[:-40], picture[-40:]
+    strip, both, legend = np.split(picture, [32, 72])
     assert strip.max() > 0
-    np.testing.assert_array_equal(below[:, :60], left)
-    np.testing.assert_array_equal(below[:, 67:], colour_disparity(disparity_px, (0, 9))[:, 7:])
-    assert (below[:, 60:67] == 0).all()
+    assert legend.shape == (40, 120, 3)
+    rows = np.r_[0:10, 30:40]  # without the cross in the middle
+    np.testing.assert_array_equal(both[rows, :60], left[rows])
+    np.testing.assert_array_equal(both[rows, 67:], colour_disparity(disparity_px, (0, 9))[rows, 7:])
+    assert (both[rows, 60:67] == 0).all()
 
 
-def test_with_a_known_camera_the_colours_are_labelled_in_metres():
+def test_a_cross_marks_the_middle_of_both_pictures():
+    grey = np.full((40, 60, 3), 90, np.uint8)
+    disparity_px = np.linspace(0, 9, 2400, dtype=np.float32).reshape(40, 60)
+    both = compose(StereoPair(left=grey, right=grey), disparity_px, (0, 9), "")[32:72]
+    for column in (30, 90):
+        assert (both[20, column - 3 : column + 4] == 255).all()
+        assert (both[17:24, column] == 255).all()
+
+
+def test_the_legend_goes_from_the_far_colour_to_the_near_one():
+    grey = np.full((40, 300, 3), 90, np.uint8)
+    disparity_px = np.zeros((40, 300), np.float32)
+    legend = compose(StereoPair(left=grey, right=grey), disparity_px, (0, 9), "")[72:]
+    ends = colour_disparity(np.array([[0, 9]], np.float32), (0, 9))[0]
+    np.testing.assert_array_equal(legend[10, [0, -1]], ends)
+    assert legend[20:].max() == 255  # the labels
+
+
+def test_with_a_known_camera_values_are_in_metres():
     camera = StereoCamera(focal_px=600, baseline_m=0.1, cx_px=320, cy_px=240)
-    assert describe_range(camera, (6.0, 40.0)) == "depth 10.00 m (blue) to 1.50 m (red)"
-    assert describe_range(None, (6.0, 40.0)) == "disparity 6.0 px (blue) to 40.0 px (red)"
+    assert label_values(camera, (6.0, 40.0, 0.0)) == ["10.00 m", "1.50 m", "infinite"]
+    assert label_values(None, (6.0, 40.0)) == ["6.0 px", "40.0 px"]
+
+
+def test_the_middle_s_depth_is_the_median_around_it():
+    grey = np.full((40, 60, 3), 90, np.uint8)
+    camera = StereoCamera(focal_px=600, baseline_m=0.1, cx_px=30, cy_px=20)
+    disparity_px = np.full((40, 60), 6, np.float32)
+    disparity_px[16:25, 26:35] = 30  # 600 * 0.1 / 30 = 2 m
+    disparity_px[20, 30] = 6  # a pixel alone does not count
+    assert describe_middle(StereoPair(left=grey, right=grey, camera=camera), disparity_px) == "2.00 m"
+
+
+def test_a_looped_video_begins_again_at_its_end(tmp_path):
+    last, seen = -1, []
+    with Capture([write_video(tmp_path / "video.avi", greys(3))], loop=True) as capture:
+        while last < 8:
+            moment = capture.newest(last)
+            assert moment is not None
+            seen.append((moment.number, number_of(moment.pictures[0])))
+            last = moment.number
+    assert len(seen) > 3
+    assert all(grey == number % 3 for number, grey in seen)
+
+
+def test_a_looped_series_of_pictures_begins_again_at_its_end(tmp_path):
+    for number, picture in enumerate(greys(3)):
+        cv2.imwrite(str(tmp_path / f"frame{number:03}.png"), picture)
+    with Capture([str(tmp_path / "frame%03d.png")], loop=True) as capture:
+        moment = capture.newest(3)
+        assert moment is not None
+        assert number_of(moment.pictures[0]) == moment.number % 3
 
 
 def test_a_tally_reports_frames_their_rate_and_their_delay(tmp_path):
@@ -262,27 +330,36 @@ def test_two_videos_are_shown_as_the_left_image_and_its_disparity(tmp_path):
         show(capture, screen, Matcher(), tally, rig=read_rig(tmp_path / "calib.txt"))
         picture = next(read_pictures(request(screen.url, "/stream")))
     assert (tally.shown, tally.last) == (1, 0)
-    assert picture.shape == (240 + 32, 640, 3)
-    assert np.abs(picture[32:, :320].astype(int) - left).mean() < 8
+    assert picture.shape == (240 + 32 + 40, 640, 3)
+    assert np.abs(picture[32:272, :320].astype(int) - left).mean() < 8
     # The top of the example is far and therefore blue; its bottom is near and therefore red.
-    top, bottom = picture[42:72, 340:620].mean((0, 1)), picture[242:, 340:620].mean((0, 1))
+    top, bottom = picture[42:72, 340:620].mean((0, 1)), picture[242:272, 340:620].mean((0, 1))
     assert top[2] > top[0]
     assert bottom[0] > bottom[2]
 
 
-def test_the_command_shows_a_video_and_prints_statistics_at_its_end(tmp_path):
+def test_the_command_shows_a_video_and_keeps_its_last_picture(tmp_path):
     video = write_video(tmp_path / "video.avi", 30 * [example_frame()], rate=10)
     with subprocess.Popen(
-        [*COMMAND, video, "--port", "0", "--no-browser"], stdout=subprocess.PIPE, text=True
+        [*COMMAND, video, "--port", "0", "--no-browser"],
+        stdout=subprocess.PIPE,
+        text=True,
+        # If a shell starts the tests in the background, interrupts are ignored by default.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     ) as process:
-        stream = read_pictures(request(read_page_url(process), "/stream"))
+        address = read_page_url(process)
+        stream = read_pictures(request(address, "/stream"))
         for picture in (next(stream), next(stream)):
-            assert picture.shape == (120 + 32, 320, 3)
-        rest, _ = process.communicate(timeout=60)
-    assert process.returncode == 0
-    counted = re.fullmatch(
-        rf"{re.escape(video)}: (\d+) of 30 frames shown, [\d.]+ per second, \d+ ms .*\n", rest
-    )
+            assert picture.shape == (120 + 32 + 40, 320, 3)
+        counted = re.fullmatch(
+            rf"{re.escape(video)}: (\d+) of 30 frames shown, [\d.]+ per second, \d+ ms .*\n",
+            process.stdout.readline(),
+        )
+        assert "last picture stays" in process.stdout.readline()
+        late = read_pictures(request(address, "/stream"))
+        assert next(late).shape == (120 + 32 + 40, 320, 3)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=60) == 0
     assert counted is not None
     assert 2 <= int(counted[1]) <= 30
 

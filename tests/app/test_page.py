@@ -8,20 +8,20 @@ import zipfile
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
 from browsers import chromium
 from page_examples import start, stop
+from page_visits import WINDOW, Visit, visiting
 from PIL import Image
 from playwright.sync_api import Browser
 
-from stereoweave.app.session import Uploads, match_uploads, write_cloud, zip_files
+from stereoweave.app.session import Uploads, match_uploads, open_session, write_cloud, zip_files
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.colormap import colour_disparity, find_colour_range_px
-from stereoweave.io.images import read_image
+from stereoweave.io.images import read_image, write_image
 from stereoweave.io.maps import read_pfm
 from stereoweave.matching.backend import Backend
 from stereoweave.outputs.point_cloud import make_point_cloud
@@ -32,9 +32,6 @@ TEXTURED = Path(__file__).resolve().parents[1] / "textured_pair"
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"  # with a far horizon
 SIZE = (640, 480)
 UNDRAWN = "cannot draw in 3-D"
-WINDOW = {"width": 1280, "height": 1000}
-# Without compiled kernels in the cache, they are compiled first.
-PATIENCE_MS = 60_000
 
 pytestmark = [pytest.mark.system, pytest.mark.needs_chromium]
 
@@ -54,76 +51,16 @@ def browser() -> Iterator[Browser]:
         yield browser
 
 
-class Visit:
-    """One visitor's window; `asked` are the URLs that it requested, `refused` those that failed."""
-
-    def __init__(self, browser: Any, address: str) -> None:
-        self.asked: list[str] = []
-        self.refused: list[str] = []
-        self._context = browser.new_context(viewport=WINDOW)
-        self.page = self._context.new_page()
-        self.page.set_default_timeout(PATIENCE_MS)
-        self.page.on("request", lambda request: self.asked.append(request.url))
-        self.page.on("response", lambda answer: answer.ok or self.refused.append(answer.url))
-        self.page.goto(address)
-        self.page.locator("#find").wait_for()
-
-    def give(self, **files: Path) -> None:
-        """Put files into the fields of these names."""
-        for field, file in files.items():
-            self.page.locator(f"#{field} input[type=file]").set_input_files(file)
-            self.page.locator(f"#{field}").get_by_text(file.name.rsplit(".", 1)[0]).first.wait_for()
-
-    def take_back(self) -> None:
-        """Clear the fields for pictures."""
-        for _ in range(self.page.get_by_label("Clear").count()):
-            self.page.get_by_label("Clear").first.click()
-
-    def find(self) -> str:
-        """Find depth, wait until the notice has changed and all files exist, and return the notice."""
-        said = self.page.locator("#status .notice")
-        before = said.inner_text() if said.count() else ""
-        self.page.click("#find")
-        self.page.wait_for_function(
-            "before => (document.querySelector('#status .notice')?.innerText ?? before) !== before",
-            arg=before,
-        )
-        if said.get_attribute("role") == "status":
-            self.page.get_by_role("tab", name="Files").click()
-            self.page.locator("#files a").first.wait_for()
-            self.page.get_by_role("tab", name="View and depth").click()
-        return said.inner_text()
-
-    def move(self, position: str) -> np.ndarray:
-        """Move the slider and return the new view."""
-        self.page.get_by_role("tab", name="View and depth").click()
-        self.page.locator("#position input[type=range]").fill(position)
-        self.page.locator("#where").get_by_text(re.compile(f"^{re.escape(position)}, ")).wait_for()
-        return self.picture("view")
-
-    def picture(self, name: str) -> np.ndarray:
-        shown = self.page.locator(f"#{name} img")
-        shown.wait_for()
-        answer = self._context.request.get(shown.get_attribute("src"))
-        assert answer.ok, (answer.status, answer.url, answer.text())
-        return np.asarray(Image.open(io.BytesIO(answer.body())).convert("RGB"))
-
-    def close(self) -> None:
-        self._context.close()
-
-
 @pytest.fixture
 def visit(browser, address) -> Iterator[Visit]:
-    visit = Visit(browser, address)
-    yield visit
-    visit.close()
+    with visiting(browser, address) as visit:
+        yield visit
 
 
 @pytest.fixture(scope="module")
 def hasty_visit(browser, address) -> Iterator[Visit]:
-    visit = Visit(browser, address)
-    yield visit
-    visit.close()
+    with visiting(browser, address) as visit:
+        yield visit
 
 
 @pytest.fixture
@@ -136,13 +73,12 @@ def hasty(hasty_visit) -> Visit:
 @pytest.fixture(scope="module")
 def answered(browser, address) -> Iterator[Visit]:
     """Yield a visitor who has uploaded the example pair and has its result."""
-    visit = Visit(browser, address)
-    visit.give(left=TEXTURED / "left.png", right=TEXTURED / "right.png")
-    visit.page.get_by_text("More about the pictures").click()
-    visit.give(calibration=TEXTURED / "calib.txt")
-    assert "640×480 px" in visit.find()
-    yield visit
-    visit.close()
+    with visiting(browser, address) as visit:
+        visit.give(left=TEXTURED / "left.png", right=TEXTURED / "right.png")
+        visit.page.get_by_text("More about the pictures").click()
+        visit.give(calibration=TEXTURED / "calib.txt")
+        assert "640×480 px" in visit.find()
+        yield visit
 
 
 def difference(one: np.ndarray, other: np.ndarray) -> float:
@@ -165,31 +101,29 @@ def test_keys_move_the_slider(answered):
 
 
 def test_the_files_are_those_of_the_command(answered, tmp_path):
-    answered.page.get_by_role("tab", name="Files").click()
-    with answered.page.expect_download() as waiting:
-        answered.page.click("#all")
-    waiting.value.save_as(tmp_path / "all.zip")
-    with zipfile.ZipFile(tmp_path / "all.zip") as archive:
+    answered.open("Files")
+    packed = answered.download("all", tmp_path)
+    with zipfile.ZipFile(packed) as archive:
         archive.extractall(tmp_path)
-    assert {file.name for file in tmp_path.iterdir()} == {"all.zip", *FILES}
+    assert {file.name for file in tmp_path.iterdir()} == {packed.name, *FILES}
     disparity_px = read_pfm(tmp_path / "disparity.pfm")
     assert disparity_px.shape == SIZE[::-1]
     # 600 px * 100 mm
     np.testing.assert_allclose(np.load(tmp_path / "depth.npy"), 60 / disparity_px, rtol=1e-5)
     expected = colour_disparity(disparity_px, find_colour_range_px(disparity_px))
-    answered.page.get_by_role("tab", name="View and depth").click()
+    answered.open("View")
     assert difference(answered.picture("depth"), expected) < 6
 
 
 def test_two_clicks_measure_a_distance(answered):
-    answered.page.get_by_role("tab", name="Measure").click()
+    answered.open("Measure")
     box = answered.page.locator("#clickable img").bounding_box()
     for count, (across, down) in enumerate(((0.3, 0.45), (0.7, 0.6)), start=1):
         answered.page.mouse.click(box["x"] + across * box["width"], box["y"] + down * box["height"])
         answered.page.locator("#measured p").get_by_text("disparity").nth(count - 1).wait_for()
         answered.page.wait_for_function("document.querySelector('#clickable img').complete")
     said = answered.page.locator("#measured").inner_text()
-    answered.page.get_by_role("tab", name="View and depth").click()
+    answered.open("View")
     points = []
     for column, row, disparity_px in re.findall(r"\((\d+), (\d+)\): disparity ([\d.]+) px", said):
         depth_m = 60 / float(disparity_px)
@@ -200,7 +134,7 @@ def test_two_clicks_measure_a_distance(answered):
 
 
 def test_the_point_cloud_is_drawn(answered):
-    answered.page.get_by_role("tab", name="Point cloud").click()
+    answered.open("3-D points")
     canvas = answered.page.locator("canvas")
     canvas.wait_for()
 
@@ -259,7 +193,7 @@ def test_a_browser_without_webgl_gets_a_notice(browser, address):
     )
     page = Visit(with_none, address).page
     page.click("#sample")
-    page.get_by_role("tab", name="Point cloud").click()
+    page.get_by_role("tab", name="3-D points").click()
     page.get_by_text(UNDRAWN).wait_for()
     with_none.close()
 
@@ -274,7 +208,26 @@ def test_an_expired_upload_is_requested_again(tmp_path):
         match=r"^calib.txt: expected an upload from the last hour, found an expired one; upload the file "
         r"again$",
     ):
-        match_uploads(uploads, tmp_path, lambda share, what: None)
+        match_uploads(uploads, lambda share, what: None)
+
+
+def test_views_of_an_aligned_pair_have_no_borders(tmp_path):
+    left, right = (read_image(TEXTURED / f"{side}.png") for side in ("left", "right"))
+    write_image(tmp_path / "left.png", left[30:450, 40:600])
+    write_image(tmp_path / "right.png", right[36:456, 40:600])  # 6 rows lower
+    uploads = Uploads(
+        pictures=(tmp_path / "left.png", tmp_path / "right.png"),
+        request=Request(rectify=True),
+        backend=Backend(),
+    )
+    result = match_uploads(uploads, lambda share, what: None)
+    session = open_session(result, tmp_path)
+    assert result.pair.left_seen is not None
+    assert session.pair.left.shape == result.pair.left.shape == (420, 560, 3)
+    height, width = session.renderer.view(0.5).image.shape[:2]
+    assert 400 < height < 420
+    assert 480 < width <= 560
+    assert session.renderer.pair.left_seen is None
 
 
 def test_large_files_are_not_zipped(tmp_path):
@@ -338,9 +291,9 @@ def test_a_far_horizon_does_not_shrink_the_viewers_point_cloud(tmp_path):
         request=Request(calibration=EXAMPLES / "calib.txt"),
         backend=Backend(),
     )
-    session = match_uploads(uploads, tmp_path, lambda share, what: None)
-    drawn = trimesh.load(write_cloud(tmp_path / "drawn.glb", session.result), force="scene").to_geometry()
+    result = match_uploads(uploads, lambda share, what: None)
+    drawn = trimesh.load(write_cloud(tmp_path / "drawn.glb", result), force="scene").to_geometry()
     depth_m = -drawn.vertices[:, 2]
-    everything_m = make_point_cloud(session.result.pair, session.result.estimate).points_m[:, 2]
+    everything_m = make_point_cloud(result.pair, result.estimate).points_m[:, 2]
     assert depth_m.max() <= 4 * np.median(everything_m) < 50 < everything_m.max()
     assert len(depth_m) > 0.8 * len(everything_m)

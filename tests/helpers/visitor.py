@@ -18,7 +18,7 @@ class Visitor:
 
     def press(self, button: str, **files: Path) -> str:
         """Press a button with files in the named fields; return the page's answer."""
-        (event, *_) = [each for each in self._events if button in map(self._name_of, each["targets"])]
+        (*_, event) = [each for each in self._events if button in map(self._name_of, each["targets"])]
         given = {field: self._uploaded(path) for field, path in files.items()}
         parts = [self._parts[part] for part in event["inputs"]]
         data = [given.get(part.get("elem_id"), part.get("value")) for part in parts]

@@ -4,6 +4,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -158,3 +159,24 @@ def test_a_process_that_could_not_be_restarted_is_started_by_a_later_call(tmp_pa
         child("true", timeout_s=10)
     assert child("true", timeout_s=10).returncode == 0
     child.close()
+
+
+def test_a_killed_process_ends_its_call_at_once_and_is_replaced(waiting):
+    assert waiting(0, timeout_s=10) is None
+    first = waiting.pid
+    with ThreadPoolExecutor(1) as pool:
+        call = pool.submit(waiting, 60, timeout_s=None)
+        while not call.running():
+            time.sleep(0.01)
+        waiting.kill()
+        with pytest.raises(ProcessDiedError, match="SIGKILL"):
+            call.result(timeout=10)
+    assert not Path(f"/proc/{first}").exists()
+    assert not waiting.has_ended
+    assert waiting(0, timeout_s=10) is None
+
+
+def test_a_process_that_is_killed_between_calls_has_ended(waiting):
+    assert waiting(0, timeout_s=10) is None
+    waiting.kill()
+    assert waiting.has_ended

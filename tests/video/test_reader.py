@@ -463,3 +463,38 @@ def test_frames_can_be_read_twice_at_the_same_time(tmp_path):
     first, second = video.frames(), video.frames()
     assert_same([next(first), next(first)], [next(second), next(second)])
     assert all(b.time - a.time == Fraction(FRAME_MS, 1000) for a, b in pairwise(video.frames()))
+
+
+def test_an_excerpt_is_a_silent_video_of_its_own(tmp_path):
+    path = write_side_by_side(tmp_path / "video.mkv", flat_pairs(10), sound=True)
+    part = open_video([path], "side_by_side").excerpt(0.11, 0.2)  # frames 3 to 7 of 25 a second
+    frames = list(part.frames())
+    assert part.frame_count == len(frames) == 5
+    assert part.sound is None
+    assert_eyes(frames, flat_pairs(10)[3:8], tolerance=2)  # the next frame differs by 2.7
+    assert [frame.time for frame in frames] == [Fraction(FRAME_MS * index, 1000) for index in range(5)]
+    assert [frame.problem for frame in frames] == 5 * [None]
+    assert_same(list(part.frames(2)), frames[2:])
+
+
+def test_an_excerpt_ends_with_its_video(tmp_path):
+    path = write_side_by_side(tmp_path / "video.mkv", flat_pairs(10))
+    video = open_video([path], "side_by_side")
+    assert [video.excerpt(start_s, 5).frame_count for start_s in (0, 0.36)] == [10, 1]
+    with pytest.raises(StereoweaveError, match=r"expected a start within the video of 0:00:00.400, found 0"):
+        video.excerpt(0.4, 5)
+
+
+@pytest.mark.testdata
+def test_a_spatial_video_is_refused_by_name(testdata):
+    said = refusal(testdata / "consumer" / "stereo_spatial.mp4")
+    assert "found a video with one view per layer (MV-HEVC, as in Apple's spatial videos); convert it" in said
+
+
+def test_each_frame_that_is_read_is_counted(tmp_path):
+    path = write_side_by_side(tmp_path / "video.mkv", flat_pairs(6))
+    video, read = open_video([path], "side_by_side"), []
+    video.on_frame = read.append
+    list(video.frames())
+    list(video.excerpt(0.08, 0.08).frames())
+    assert read == [0, 1, 2, 3, 4, 5, 0, 1]

@@ -1,0 +1,68 @@
+"""Long work of the page as Gradio's events, which a button cancels and a closed tab ends."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gradio as gr
+
+from stereoweave.app.notices import format_notice
+from stereoweave.app.workers import Done, Work, Workers
+
+# Results are kept for an hour.
+LIFETIME_S = 3600
+# Settings of the events that work on pictures: two visitors' jobs go forward at once. On two cores, two pairs
+# at once take as long as one after the other (18 to 33 s and 24 to 34 s, three times), whether each has all
+# threads or half of them; with all threads, a pair alone takes half as long.
+MATCHING: dict[str, Any] = {"concurrency_id": "matching", "concurrency_limit": 2, "api_visibility": "private"}
+# One film at a time, beside the pictures, because a film takes minutes.
+FILMS: dict[str, Any] = {"concurrency_id": "films", "concurrency_limit": 1, "api_visibility": "private"}
+_CANCELLED = "Cancelled. Anything below is from before. Change what you like, and start again."
+
+
+@dataclass(frozen=True)
+class Host:
+    """What the page's parts share: a folder for results, processes for long work, and the provider."""
+
+    folder: Path
+    workers: Workers
+    provider: str
+
+    async def work(self, request: gr.Request, work: Work[Done], progress: Any) -> Done:
+        """Do a visitor's work in a process, and show its progress. Raises the errors of `Workers.run`."""
+        return await self.workers.run(str(request.session_hash), work, partial(_show_progress, progress))
+
+
+def connect_cancel(cancel: gr.Button, status: gr.HTML, events: Sequence[Any]) -> None:
+    """Let a button cancel these events; it can be pressed while one of them is running or waiting."""
+    cancel.click(
+        lambda: (format_notice([_CANCELLED]), gr.update(interactive=False)),
+        None,
+        [status, cancel],
+        cancels=list(events),
+        concurrency_limit=None,
+        api_visibility="private",
+    )
+
+
+def switch(cancel: gr.Button, triggers: Sequence[Any], *, on: bool) -> None:
+    """Switch the button to cancel on or off at these triggers.
+
+    A browser runs the events of a trigger one after the other, so the button must be switched on before the
+    trigger is connected to its work.
+    """
+    for trigger in triggers:
+        trigger(
+            partial(gr.update, interactive=on),
+            None,
+            cancel,
+            show_progress="hidden",
+            concurrency_limit=None,
+            api_visibility="private",
+        )
+
+
+def _show_progress(progress: Any, share: float, what: str) -> None:
+    progress(share, desc=what)

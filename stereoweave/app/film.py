@@ -1,0 +1,210 @@
+"""Conversion of an uploaded stereo film, or of some seconds of it, without the user interface."""
+
+import io
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.console import Console
+
+from stereoweave.app.session import check_uploads
+from stereoweave.errors import FormatError, NameOf, StereoweaveError
+from stereoweave.io.animation import require_video_extra
+from stereoweave.matching.backend import Backend
+from stereoweave.rendering.layouts import LayoutOptions, add_mark
+from stereoweave.stereo import StereoPair
+
+if TYPE_CHECKING:
+    from stereoweave.video.convert import VideoTally
+    from stereoweave.video.reader import StereoVideo
+
+PREVIEW_S = 5
+# FFmpeg's names of containers that refer to no other file.
+_CONTAINERS = ("mp4", "matroska", "avi", "mpegts", "mpeg", "asf", "flv", "ogg")
+# The share of the work that looks for the disparities of the whole film, before the conversion.
+_SURVEY_SHARE = 0.15
+
+
+@dataclass(frozen=True)
+class Output:
+    """What a film is converted to: its label, how to look at it, and the settings of `VideoJob`."""
+
+    label: str
+    viewing: str
+    settings: dict[str, Any]
+
+
+OUTPUTS: dict[str, Output] = {
+    "depth": Output("Depth in colour", "Red is near, blue is far.", {"depth": True}),
+    "between": Output("View from between the cameras", "An ordinary film.", {"position": 0.5}),
+    "side_by_side": Output(
+        "Side by side", "For VR headsets: the left eye's view is on the left.", {"layout": "side_by_side"}
+    ),
+    "side_by_side_half": Output(
+        "Side by side, half width",
+        "For 3-D televisions, which stretch each half to the full width.",
+        {"layout": "side_by_side_half"},
+    ),
+    "crossed": Output("Crossed", "Cross your eyes until the two pictures become one.", {"layout": "crossed"}),
+    "top_bottom": Output(
+        "Top and bottom", "For VR headsets: the left eye's view is on top.", {"layout": "top_bottom"}
+    ),
+    "anaglyph_dubois": Output(
+        "Anaglyph", "Look through red-cyan glasses, red on the left eye.", {"layout": "anaglyph_dubois"}
+    ),
+    "rgbd": Output(
+        "Picture and depth", "For programs and displays that read colour with depth.", {"layout": "rgbd"}
+    ),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Film:
+    """A visitor's uploaded film and settings.
+
+    Attributes:
+        files: One file with both views, or a left and a right one.
+        format: Frame packing; None to detect it.
+        output: What to make, a name in `OUTPUTS`.
+        start_s: Where a preview of `PREVIEW_S` seconds begins; None to convert the whole film.
+        backend: The network.
+        name_of: The form's names for settings.
+    """
+
+    files: tuple[Path, ...]
+    format: str | None
+    output: str
+    start_s: float | None
+    backend: Backend
+    name_of: NameOf
+
+
+@dataclass(frozen=True)
+class ConvertedFilm:
+    """A converted film: its file, a line about it, and warnings."""
+
+    file: Path
+    summary: str
+    warnings: list[str]
+
+
+def convert_film(film: Film, folder: Path, report: Callable[[float, str], None]) -> ConvertedFilm:
+    """Convert an uploaded film, or a part of it; the result is written to `folder`.
+
+    Raises:
+        StereoweaveError: See `open_video` and `convert_video`; or there is no film, or it has expired.
+    """
+    if not film.files:
+        raise StereoweaveError("expected a film with both views, or a left and a right film, found none")
+    check_uploads(film.files)
+    for file in film.files:
+        _check_container(file)
+    with require_video_extra("a film"):
+        from stereoweave.video.convert import convert_video
+        from stereoweave.video.job import VideoJob
+        from stereoweave.video.reader import open_video
+    report(0.0, "opening the film")
+    video = open_video(film.files, film.format)
+    whole_count = video.frame_count
+    if film.start_s is not None:
+        video = video.excerpt(film.start_s, PREVIEW_S)
+    video.on_frame = shown = _FrameReport(video.frame_count, report)
+    job = VideoJob(**OUTPUTS[film.output].settings, backend=film.backend, name_of=film.name_of)
+    console = _NoteConsole()
+    out = _name_file(film, video, folder)
+    tally = convert_video(video, film.files, out, job, console)
+    summary = _describe(film, video)
+    if film.start_s is not None:
+        whole_s = shown.spent_s / video.frame_count * whole_count
+        summary += f" A preview has no sound. The whole film takes about {_format_duration(whole_s)}."
+    return ConvertedFilm(out, summary, [*console.lines, *_describe_problems(tally)])
+
+
+def _check_container(file: Path) -> None:
+    """Raise FormatError unless a film holds its own content.
+
+    Playlists and the like name other files, which FFmpeg would read wherever they lie on the disk.
+    """
+    with require_video_extra("a film"):
+        import av
+    try:
+        av.open(str(file), options={"format_whitelist": ",".join(_CONTAINERS)}).close()
+    except av.error.FFmpegError as error:
+        raise FormatError(
+            f"{file.name}: expected a film (MP4, MOV, MKV, WebM, AVI, MPEG, WMV, FLV or OGG), found another "
+            "kind of file, or a damaged one"
+        ) from error
+
+
+class _FrameReport:
+    """Report of the frames read: first those of the survey, then those of the conversion."""
+
+    def __init__(self, count: int, report: Callable[[float, str], None]) -> None:
+        self._count, self._report, self._passes, self._begin_s = count, report, 0, 0.0
+
+    def __call__(self, number: int) -> None:
+        if number == 0:
+            self._passes, self._begin_s = self._passes + 1, time.monotonic()
+        share = number / self._count
+        if self._passes == 1:
+            self._report(_SURVEY_SHARE * share, "looking through the film")
+            return
+        left = number and f", about {_format_duration(self.spent_s / number * (self._count - number))} left"
+        self._report(
+            _SURVEY_SHARE + (1 - _SURVEY_SHARE) * share, f"frame {number + 1} of {self._count}{left or ''}"
+        )
+
+    @property
+    def spent_s(self) -> float:
+        """The time since the conversion began."""
+        return time.monotonic() - self._begin_s
+
+
+def _format_duration(seconds: float) -> str:
+    """Format a duration, rounded as befits an estimate."""
+    if seconds < 90:
+        return f"{max(1, round(seconds))} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 90 else f"{seconds / 3600:.1f} h"
+
+
+class _NoteConsole(Console):
+    """Console that collects the printed lines and shows nothing."""
+
+    def __init__(self) -> None:
+        super().__init__(file=io.StringIO())
+        self.lines: list[str] = []
+
+    def print(self, *objects: Any, **_: Any) -> None:
+        """Keep the lines; a progress bar is not one."""
+        self.lines += [line for line in objects if isinstance(line, str)]
+
+
+def _name_file(film: Film, video: "StereoVideo", folder: Path) -> Path:
+    """Return the file to write, whose name has the mark by which players recognise a layout."""
+    kind = "" if film.start_s is None else "_preview"
+    file = folder / f"{film.files[0].stem}_{film.output}{kind}.mp4"
+    layout = OUTPUTS[film.output].settings.get("layout")
+    if layout is None:
+        return file
+    blank = np.broadcast_to(np.uint8(0), (*reversed(video.size_px), 3))
+    return add_mark(file, layout, StereoPair(left=blank, right=blank), LayoutOptions())
+
+
+def _describe(film: Film, video: "StereoVideo") -> str:
+    """Describe a converted film in one line."""
+    width, height = video.size_px
+    length_s = float(video.frame_count / video.rate)
+    frames = f"{video.frame_count} frames of {width}×{height} px, {length_s:.1f} s"
+    packing = f", read as {video.frame_packing.replace('_', ' ')}" if video.frame_packing else ""
+    return f"{OUTPUTS[film.output].label}: {frames}{packing}. {OUTPUTS[film.output].viewing}"
+
+
+def _describe_problems(tally: "VideoTally") -> list[str]:
+    if not tally.problems:
+        return []
+    more = "; ..." if tally.problems > len(tally.named) else ""
+    return [f"problems in {tally.problems} of {tally.frames} frames: {'; '.join(tally.named)}{more}"]

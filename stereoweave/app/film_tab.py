@@ -1,0 +1,149 @@
+"""The page's part for films: a stereo film becomes depth, a view or a layout, after a short preview."""
+
+import shutil
+import tempfile
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gradio as gr
+
+from stereoweave.app.events import FILMS, LIFETIME_S, Host, connect_cancel, switch
+from stereoweave.app.film import OUTPUTS, PREVIEW_S, ConvertedFilm, Film, convert_film
+from stereoweave.app.notices import Wording, format_notice, format_warnings, name_setting
+from stereoweave.app.pair_form import MODELS, make_layout_choice, read_layout
+from stereoweave.errors import StereoweaveError
+from stereoweave.matching.backend import Backend
+from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS
+
+_EMPTY = f"""<div class="empty"><ol>
+<li>Drop a 3-D film: one file that holds both views, or a left and a right file.</li>
+<li>Choose what to make, and press <b>Preview {PREVIEW_S} seconds</b> to see whether you like it.</li>
+<li>Press <b>Convert the whole film</b>. It takes many times the film's own length; keep this page open.</li>
+</ol></div>"""
+_LABELS = {"format": "Layout of a single film", "model": "Quality"}
+# A partial, because it is sent to the process that does the work.
+label_of = partial(name_setting, _LABELS)
+
+
+class FilmTab:
+    """Components and event handlers for a film; the result is kept for an hour."""
+
+    def __init__(self, host: Host) -> None:
+        self._host, self._wording = host, Wording(host.folder, label_of)
+        self._made = gr.State(None, time_to_live=LIFETIME_S, delete_callback=_remove_film)
+        with gr.Row():
+            with gr.Column(scale=1, min_width=280):
+                self._build_form()
+            with gr.Column(scale=3, min_width=280):
+                self._status = gr.HTML(_EMPTY, elem_id="film-status", padding=False)
+                self._shown = gr.Video(
+                    label="Result", visible=False, interactive=False, autoplay=True, elem_id="film"
+                )
+                self._file = gr.DownloadButton(
+                    "Download", variant="primary", visible=False, elem_id="film-file"
+                )
+        self._connect()
+
+    def _build_form(self) -> None:
+        """Build the form for the film and its settings."""
+        self._left = gr.File(label="Film with both views, or the left one", height=160, elem_id="film-left")
+        self._right = gr.File(label="Right film, if there are two", height=160, elem_id="film-right")
+        self._output = gr.Dropdown(
+            [(output.label, name) for name, output in OUTPUTS.items()],
+            value="depth",
+            label="What to make",
+            elem_id="film-output",
+        )
+        self._start_s = gr.Number(
+            0,
+            minimum=0,
+            label="Begin the preview at second",
+            info="0: the start",
+            elem_id="film-start",
+        )
+        with gr.Accordion("More about the film", open=False):
+            self._layout = make_layout_choice(_LABELS["format"], PAIR_LAYOUTS, "film-layout")
+            self._model = gr.Radio(MODELS[:2], value="small", label=_LABELS["model"], elem_id="film-model")
+        self._preview = gr.Button(f"Preview {PREVIEW_S} seconds", variant="primary", elem_id="film-preview")
+        self._whole = gr.Button("Convert the whole film", elem_id="film-whole")
+        self._cancel = gr.Button("Cancel", variant="stop", interactive=False, elem_id="film-cancel")
+
+    def _connect(self) -> None:
+        """Connect events to their handlers."""
+        asked: set[Any] = {
+            self._left,
+            self._right,
+            self._output,
+            self._start_s,
+            self._layout,
+            self._model,
+            self._made,
+        }
+        shown = [self._status, self._shown, self._file, self._made]
+        begins = [self._preview.click, self._whole.click]
+        switch(self._cancel, begins, on=True)
+        events = [
+            begin(handler, asked, shown, show_progress_on=self._status, **FILMS)
+            for begin, handler in zip(begins, (self._preview_film, self._convert_whole), strict=True)
+        ]
+        connect_cancel(self._cancel, self._status, events)
+        switch(self._cancel, [event.then for event in events], on=False)
+
+    async def _preview_film(
+        self,
+        given: dict[Any, Any],
+        request: gr.Request,
+        progress: Any = gr.Progress(),  # noqa: B008
+    ) -> dict[Any, Any]:
+        """Convert some seconds of the film, and return the page's new content."""
+        return await self._convert(given, given[self._start_s] or 0, request, progress)
+
+    async def _convert_whole(
+        self,
+        given: dict[Any, Any],
+        request: gr.Request,
+        progress: Any = gr.Progress(),  # noqa: B008
+    ) -> dict[Any, Any]:
+        """Convert the whole film, and return the page's new content."""
+        return await self._convert(given, None, request, progress)
+
+    async def _convert(
+        self, given: dict[Any, Any], start_s: float | None, request: gr.Request, progress: Any
+    ) -> dict[Any, Any]:
+        folder = Path(tempfile.mkdtemp(dir=self._host.folder))
+        work = partial(convert_film, self._read(given, start_s), folder)
+        made: ConvertedFilm | None = None
+        try:
+            made = await self._host.work(request, work, progress)
+        except (StereoweaveError, OSError) as error:
+            return {self._status: self._wording.format_error(error)}
+        finally:
+            if made is None:
+                shutil.rmtree(folder, ignore_errors=True)
+        _remove_film(given[self._made])
+        size_mb = made.file.stat().st_size / 1e6
+        return {
+            self._status: format_warnings(made.warnings) + format_notice([made.summary]),
+            self._shown: gr.update(value=str(made.file), visible=True),
+            self._file: gr.update(
+                value=str(made.file), label=f"Download {made.file.name} ({size_mb:.1f} MB)", visible=True
+            ),
+            self._made: made,
+        }
+
+    def _read(self, given: dict[Any, Any], start_s: float | None) -> Film:
+        return Film(
+            files=tuple(Path(file) for file in (given[self._left], given[self._right]) if file),
+            format=read_layout(given[self._layout]),
+            output=given[self._output],
+            start_s=start_s,
+            backend=Backend(model=given[self._model], provider=self._host.provider),
+            name_of=label_of,
+        )
+
+
+def _remove_film(made: ConvertedFilm | None) -> None:
+    """Remove a film that is no longer shown."""
+    if made:
+        shutil.rmtree(made.file.parent, ignore_errors=True)

@@ -1,0 +1,112 @@
+"""The page's form for a pair of pictures and its settings."""
+
+import importlib.resources
+from collections.abc import Iterable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gradio as gr
+
+from stereoweave.app.notices import name_setting
+from stereoweave.app.session import Uploads
+from stereoweave.matching.backend import Backend
+from stereoweave.pictures.loading import FORMATS
+from stereoweave.pictures.prepare import Request
+
+_DETECTED = "detected"
+MODELS = [("fast", "small"), ("fine", "base"), ("finest", "best")]
+
+# Labels of the form's fields, by setting.
+_LABELS = {
+    "format": "Layout of a single file",
+    "baseline_m": "Baseline, mm",
+    "calibration": "Calibration file, for metres",
+    "focal_px": "Focal length, px",
+    "model": "Quality",
+    "rectify": "Align the pictures",
+}
+label_of = partial(name_setting, _LABELS)
+
+
+class PairForm:
+    """The fields for the pictures and settings, and the buttons."""
+
+    def __init__(self) -> None:
+        self.left = gr.File(label="Left picture, or one file with both views", height=160, elem_id="left")
+        self.right = gr.File(label="Right picture", height=160, elem_id="right")
+        self.rectify = gr.Checkbox(
+            label=_LABELS["rectify"],
+            info="For pictures taken by hand or by two separate cameras. Not for 3-D films and 3-D cameras.",
+            elem_id="rectify",
+        )
+        self.model = gr.Radio(
+            MODELS,
+            value="small",
+            label=_LABELS["model"],
+            info="Finer takes longer: fine 2 times, finest 5 times.",
+            elem_id="model",
+        )
+        with gr.Accordion("More about the pictures", open=False):
+            self.layout = make_layout_choice(_LABELS["format"], FORMATS, "layout")
+            self.calibration = gr.File(label=_LABELS["calibration"], height=140, elem_id="calibration")
+            with gr.Row():
+                self.focal_px = _make_optional_number(_LABELS["focal_px"], "focal")
+                self.baseline_mm = _make_optional_number(_LABELS["baseline_m"], "baseline")
+        self.find = gr.Button("Find depth", variant="primary", elem_id="find")
+        self.cancel = gr.Button("Cancel", variant="stop", interactive=False, elem_id="cancel")
+        self.sample = gr.Button("Try the sample", elem_id="sample")
+
+    @property
+    def fields(self) -> list[Any]:
+        """All fields."""
+        pictures = [self.left, self.right, self.model, self.rectify, self.layout, self.calibration]
+        return [*pictures, self.focal_px, self.baseline_mm]
+
+    def fill_in_sample(self) -> dict[Any, Any]:
+        """Return the fields' values for the package's sample pair."""
+        folder = sample_folder()
+        return {
+            self.left: str(folder / "left.jpg"),
+            self.right: str(folder / "right.jpg"),
+            self.calibration: str(folder / "calib.txt"),
+            self.model: "small",
+            self.rectify: False,
+            self.layout: _DETECTED,
+            self.focal_px: 0,
+            self.baseline_mm: 0,
+        }
+
+    def read(self, given: dict[Any, Any], provider: str) -> Uploads:
+        """Return the uploads and settings that a visitor has given."""
+        calibration, baseline_mm = given[self.calibration], given[self.baseline_mm] or None
+        request = Request(
+            format=read_layout(given[self.layout]),
+            calibration=Path(calibration) if calibration else None,
+            focal_px=given[self.focal_px] or None,
+            baseline_m=baseline_mm and baseline_mm / 1000,
+            rectify=given[self.rectify],
+        )
+        pictures = tuple(Path(file) for file in (given[self.left], given[self.right]) if file)
+        backend = Backend(model=given[self.model], provider=provider)
+        return Uploads(pictures=pictures, request=request, backend=backend)
+
+
+def sample_folder() -> Path:
+    """Return the folder that contains the sample pair."""
+    return Path(str(importlib.resources.files("stereoweave"))) / "sample"
+
+
+def make_layout_choice(label: str, names: Iterable[str], elem_id: str) -> gr.Dropdown:
+    """Make a field to choose how one file holds both views; the first choice is to detect it."""
+    choices: list[Any] = [_DETECTED, *((name.replace("_", " "), name) for name in names)]
+    return gr.Dropdown(choices, value=_DETECTED, label=label, elem_id=elem_id)
+
+
+def read_layout(given: str) -> str | None:
+    """Return the layout that a visitor has chosen; None to detect it."""
+    return None if given == _DETECTED else given
+
+
+def _make_optional_number(label: str, name: str) -> gr.Number:
+    return gr.Number(0, label=label, info="0: unknown", min_width=120, elem_id=name)

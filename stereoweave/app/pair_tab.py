@@ -1,0 +1,315 @@
+"""The page's part for a pair of pictures: its form, and the tabs that show its depth."""
+
+import asyncio
+import shutil
+import tempfile
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+import gradio as gr
+
+from stereoweave.app.events import LIFETIME_S, MATCHING, Host, connect_cancel, switch
+from stereoweave.app.notices import (
+    Wording,
+    format_legend,
+    format_notice,
+    format_paragraphs,
+    format_warnings,
+)
+from stereoweave.app.pair_form import PairForm, label_of
+from stereoweave.app.session import (
+    Session,
+    colour_depth,
+    format_colour_range,
+    format_summary,
+    mark_clicks,
+    match_uploads,
+    measure_clicks,
+    open_session,
+    write_all,
+    write_cloud,
+)
+from stereoweave.app.stereo_picture_tab import StereoPictureTab
+from stereoweave.errors import Note, StereoweaveError
+from stereoweave.io.colormap import OCCLUDED_RGB, colour_confidence, css_colour, legend_colours
+from stereoweave.outputs.run import Result
+
+_EMPTY = """<div class="empty"><ol>
+<li>Drop the left and the right picture, or one file that holds both:
+side by side, one above the other, MPO or JPS.</li>
+<li>Press <b>Find depth</b>. If the pictures come from your hand or from two separate cameras, tick
+<b>Align the pictures</b>.</li>
+<li>Move between the cameras, turn the points in 3-D, measure, and download 3-D pictures and files.</li>
+</ol></div>"""
+_ABOUT_FILES = """<p><b>report.html</b> shows the result in any browser; <b>preview.png</b> is the depth in
+colour. <b>depth</b> is in metres, <b>disparity</b> in pixels; <b>cloud</b> and <b>mesh</b> open in 3-D
+programs. PNG files are for image editors; PFM, NPY and TIFF files are for programming. There are metres, and
+thus depth, cloud and mesh, only with a calibration, or with focal length and baseline.</p>"""
+_GUESSED_POINTS = "The proportions are a guess: without a calibration, the cameras are unknown."
+_TO_MEASURE = "Click two points in the left picture to see their depths and the distance between them here."
+_WITHOUT_WEBGL = """const canvas = document.createElement("canvas");
+if (!canvas.getContext("webgl2") && !canvas.getContext("webgl")) element.innerHTML =
+  '<p class="notice problem">This browser cannot draw in 3-D: turn on its hardware acceleration ' +
+  '(WebGL). If metres are known, open cloud.glb, under Files, in another program.</p>';"""
+_GONE = "This result has expired (results are kept for an hour). Find depth again."
+
+
+class PairTab:
+    """Components and event handlers for a pair; the files to download are kept for an hour."""
+
+    def __init__(self, host: Host) -> None:
+        self._host, self._wording = host, Wording(host.folder, label_of)
+        self._session = gr.State(None, time_to_live=LIFETIME_S, delete_callback=_remove_files)
+        self._clicks = gr.State([])
+        with gr.Row():
+            with gr.Column(scale=1, min_width=280):
+                self._form = PairForm()
+            with gr.Column(scale=3, min_width=280):
+                self._status = gr.HTML(_EMPTY, elem_id="status", padding=False)
+                with gr.Column(visible=False) as self._results:
+                    self._build_results()
+        self._connect()
+
+    def _build_results(self) -> None:
+        """Build the part that shows results."""
+        with gr.Tabs() as self._tabs:
+            with gr.Tab("View", id="first"):
+                self._build_views()
+            with gr.Tab("3-D picture") as self._picture_tab:
+                self._stereo = StereoPictureTab(self._host, self._wording)
+            with gr.Tab("3-D points") as self._cloud_tab:
+                gr.HTML(js_on_load=_WITHOUT_WEBGL, padding=False)
+                self._about_points = gr.HTML(elem_id="about-points")
+                self._cloud = gr.Model3D(
+                    label="Drag to turn, scroll or pinch to zoom",
+                    clear_color=(0.94, 0.95, 0.96, 1.0),
+                    height=560,
+                )
+            with gr.Tab("Measure"):
+                self._measured = gr.HTML(elem_id="measured")
+                self._clickable = _make_picture("Left picture", "clickable")
+            with gr.Tab("Files"):
+                gr.HTML(_ABOUT_FILES, elem_id="about-files")
+                self._all = gr.DownloadButton("Download all (zip)", variant="primary", elem_id="all")
+                self._files = gr.File(label="One at a time", interactive=False, elem_id="files")
+
+    def _build_views(self) -> None:
+        """Build the tab with the view, its slider, the depth and the confidence."""
+        self._view = _make_picture("New view", "view")
+        self._position = gr.Slider(
+            -0.5,
+            1.5,
+            value=0.5,
+            step=0.05,
+            label="Viewpoint",
+            info="0 is the left camera, 1 the right one",
+            buttons=[],
+            elem_id="position",
+        )
+        self._where = gr.HTML(elem_id="where")
+        with gr.Row():
+            with gr.Column(min_width=280):
+                self._depth = _make_picture("Depth", "depth")
+                self._ramp = gr.HTML()
+            with gr.Column(min_width=280):
+                self._confidence = _make_picture("Confidence", "confidence")
+                gr.HTML(_format_confidence_legend())
+
+    def _connect(self) -> None:
+        """Connect events to their handlers."""
+        form, taken = self._form, [self._status, *self._file_parts]
+        switch(form.cancel, [form.find.click, form.sample.click], on=True)
+        sampled = form.sample.click(form.fill_in_sample, None, form.fields, api_visibility="private")
+        long, ends = [], []
+        for begin in (form.find.click, sampled.then):
+            found = begin(
+                self._find_depth,
+                {*form.fields, self._position, self._session},
+                [*taken, *self._shown_parts],
+                show_progress_on=self._status,
+                **MATCHING,
+            )
+            written = found.then(
+                self._write_files, self._session, taken, show_progress_on=self._status, **MATCHING
+            )
+            long += [found, written]
+            ends.append(written.then)
+        made = self._stereo.connect(self._picture_tab, self._session, form.cancel)
+        connect_cancel(form.cancel, self._status, [*long, *made])
+        switch(form.cancel, [*ends, *(event.then for event in made)], on=False)
+        self._connect_views()
+
+    def _connect_views(self) -> None:
+        """Connect the events of the results that are drawn at once."""
+        self._position.input(
+            self._render_view,
+            [self._session, self._position],
+            [self._view, self._where],
+            show_progress="hidden",
+            trigger_mode="always_last",
+            concurrency_limit=None,
+            api_visibility="private",
+        )
+        # The point cloud is loaded when its tab is opened, under a new name each time. Gradio's viewer stays
+        # empty if its value arrives before the viewer is visible, or if the same value arrives twice.
+        self._cloud_tab.select(self._make_cloud, self._session, self._cloud, api_visibility="private")
+        self._clickable.select(
+            self._measure_click,
+            [self._session, self._clicks],
+            [self._clickable, self._measured, self._clicks],
+            show_progress="hidden",
+            trigger_mode="multiple",
+            concurrency_limit=None,
+            api_visibility="private",
+        )
+
+    @property
+    def _file_parts(self) -> list[Any]:
+        return [self._files, self._all]
+
+    @property
+    def _shown_parts(self) -> list[Any]:
+        pictures = [self._view, self._where, self._depth, self._ramp, self._confidence, self._clickable]
+        parts = [self._results, self._session, self._clicks, self._measured, self._tabs, self._cloud]
+        parts.append(self._about_points)
+        return [*pictures, *parts, *self._stereo.parts]
+
+    async def _find_depth(
+        self,
+        given: dict[Any, Any],
+        request: gr.Request,
+        progress: Any = gr.Progress(),  # noqa: B008
+    ) -> dict[Any, Any]:
+        """Match the given pictures, and return the page's new content: the result or an error."""
+        try:
+            uploads = self._form.read(given, self._host.provider)
+            result = await self._host.work(request, partial(match_uploads, uploads), progress)
+            progress(0.6, desc="showing")
+            # Otherwise, all other visitors would wait.
+            shown = await asyncio.to_thread(self._open_result, result, given[self._position])
+        except (StereoweaveError, OSError) as error:
+            shown = {
+                self._status: self._wording.format_error(error),
+                self._results: gr.update(visible=False),
+                self._session: None,
+            }
+        _remove_files(given[self._session])
+        return shown
+
+    async def _write_files(
+        self,
+        session: Session | None,
+        request: gr.Request,
+        progress: Any = gr.Progress(),  # noqa: B008
+    ) -> dict[Any, Any]:
+        """Write the result's files. This takes as long as all previous steps together."""
+        if session is None:
+            return {self._files: None}
+        if session.is_written:  # a cancelled job is followed by this step, too
+            return {self._files: gr.skip()}
+        work = partial(write_all, session.result, session.folder)
+        try:
+            written = await self._host.work(request, work, progress)
+        except (StereoweaveError, OSError) as error:
+            return {self._status: self._wording.format_error(error)}
+        banner = format_warnings(self._wording.format_notes(written.warnings))
+        archive = written.archive
+        return {
+            self._status: banner + self._format_summary(session, written.notes),
+            self._files: [str(file) for file in written.files],
+            self._all: gr.update(value=archive and str(archive), visible=archive is not None),
+        }
+
+    def _format_summary(self, session: Session, notes: Sequence[Note] = ()) -> str:
+        lines = self._wording.format_notes([*session.result.notes, *notes])
+        return format_notice([format_summary(session.result.summary), *lines])
+
+    def _open_result(self, result: Result, position: float) -> dict[Any, Any]:
+        folder = Path(tempfile.mkdtemp(dir=self._host.folder))
+        return self._show_result(open_session(result, folder), position)
+
+    def _show_result(self, session: Session, position: float) -> dict[Any, Any]:
+        pair, estimate = session.pair, session.estimate
+        view, where = self._render_view(session, position)
+        return {
+            self._status: self._format_summary(session),
+            self._results: gr.update(visible=True),
+            self._session: session,
+            self._view: view,
+            self._where: where,
+            self._depth: colour_depth(session),
+            self._ramp: _format_depth_legend(session),
+            self._confidence: colour_confidence(estimate.confidence, estimate.occluded),
+            self._clickable: pair.left,
+            self._clicks: [],
+            self._tabs: gr.update(selected="first"),
+            self._measured: format_paragraphs([_TO_MEASURE]),
+            self._cloud: None,
+            self._about_points: "" if session.result.pair.camera else format_paragraphs([_GUESSED_POINTS]),
+            self._files: None,
+            self._all: gr.update(value=None, visible=False),
+            **self._stereo.empty(),
+        }
+
+    def _render_view(self, session: Session | None, position: float) -> tuple[Any, str]:
+        """Render the view from a position, and return the image and a one-line description."""
+        if session is None:
+            return gr.skip(), _GONE
+        view = session.renderer.view(position)
+        unseen = f"{100 * (~view.drawn).mean():.1f} % of it seen by neither camera"
+        return view.image, f"{position:g}, {_describe_position(position)}; {unseen}"
+
+    def _make_cloud(self, session: Session | None) -> str | None:
+        """Write the point cloud, and return the path of its file; None if there is no point cloud."""
+        cloud = session and write_cloud(session.folder / f"{uuid4().hex}.glb", session.result)
+        return str(cloud) if cloud else None
+
+    def _measure_click(
+        self, session: Session | None, clicks: list[tuple[int, int]], event: gr.SelectData
+    ) -> tuple[Any, str, list[tuple[int, int]]]:
+        """Mark up to two clicked points in the left image, and describe their depths and their distance."""
+        if session is None:
+            return gr.skip(), format_paragraphs([_GONE]), []
+        column, row = event.index
+        clicks = [*(clicks if len(clicks) < 2 else []), (int(column), int(row))]
+        return (
+            mark_clicks(session.pair.left, clicks),
+            format_paragraphs(measure_clicks(session, clicks)),
+            clicks,
+        )
+
+
+def _remove_files(session: Session | None) -> None:
+    """Remove the files of a result that is no longer shown."""
+    if session:
+        shutil.rmtree(session.folder, ignore_errors=True)
+
+
+def _make_picture(label: str, name: str) -> gr.Image:
+    return gr.Image(
+        label=label, format="jpeg", interactive=False, buttons=["fullscreen"], elem_id=name, alt_text=label
+    )
+
+
+def _format_depth_legend(session: Session) -> str:
+    far, near = format_colour_range(session.result)
+    return format_legend(
+        f"linear-gradient(90deg,{','.join(legend_colours(24))})", f"far: {far}", f"near: {near}"
+    )
+
+
+def _format_confidence_legend() -> str:
+    key = f'<i class="key" style="background:{css_colour(OCCLUDED_RGB)}"></i>seen by the left camera only'
+    return format_legend("linear-gradient(90deg,#000,#fff)", "unsure", key, "sure")
+
+
+def _describe_position(position: float) -> str:
+    """Describe the position of a view in words."""
+    if position in (0, 1):
+        return "the right picture itself" if position else "the left picture itself"
+    if position < 0:
+        return "left of the left camera"
+    return "right of the right camera" if position > 1 else "between the cameras"

@@ -1,0 +1,306 @@
+"""Long work of the page in Chromium: visitors at once, cancelling, leaving, and 3-D pictures and films."""
+
+import io
+import re
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+from browsers import chromium
+from page_examples import start, stop
+from page_visits import Visit, visiting
+from PIL import Image
+from playwright.sync_api import Browser
+from video_examples import example_pairs, packed, write_video
+
+from stereoweave.app.film import Film, convert_film
+from stereoweave.app.film_tab import label_of
+from stereoweave.app.stereo_pictures import KINDS
+from stereoweave.errors import FormatError
+from stereoweave.io.images import read_image, write_image
+from stereoweave.matching.backend import Backend
+
+TEXTURED = Path(__file__).resolve().parents[1] / "textured_pair"
+WIDTH, HEIGHT = 320, 240
+WAIT_S = 60
+AT_WORK = re.compile("looking through the film|frame \\d")
+
+pytestmark = [pytest.mark.system, pytest.mark.needs_chromium]
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory) -> Iterator[tuple[int, str]]:
+    """Serve the page; yield the server's process ID and address."""
+    server, address = start(tmp_path_factory.mktemp("page"))
+    yield server.pid, address
+    assert stop(server) == ""
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with chromium() as browser:
+        yield browser
+
+
+@pytest.fixture
+def visit(browser, server) -> Iterator[Visit]:
+    with visiting(browser, server[1]) as visit:
+        yield visit
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory) -> dict[str, Path]:
+    """Write the example pair at half its size."""
+    folder = tmp_path_factory.mktemp("pair")
+    for side in ("left", "right"):
+        whole = read_image(TEXTURED / f"{side}.png")
+        write_image(folder / f"{side}.png", cv2.resize(whole, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA))
+    return {side: folder / f"{side}.png" for side in ("left", "right")}
+
+
+@pytest.fixture(scope="module")
+def large_pair(tmp_path_factory) -> dict[str, Path]:
+    """Write the example pair at 4 times its size; the finest network takes minutes for it."""
+    folder = tmp_path_factory.mktemp("large")
+    for side in ("left", "right"):
+        whole = read_image(TEXTURED / f"{side}.png")
+        write_image(folder / f"{side}.jpg", cv2.resize(whole, (2560, 1920), interpolation=cv2.INTER_CUBIC))
+    return {side: folder / f"{side}.jpg" for side in ("left", "right")}
+
+
+@pytest.fixture(scope="module")
+def endless_film(tmp_path_factory) -> Path:
+    """Write a film of six minutes, whose conversion takes longer."""
+    film = tmp_path_factory.mktemp("film") / "endless.mp4"
+    frames = [packed(*pair) for pair in example_pairs(50)]
+    return write_video(film, frames * 180)
+
+
+def workers_of(pid: int) -> set[int]:
+    """Return the process IDs of a server's children."""
+    tasks = Path(f"/proc/{pid}/task").glob("*/children")
+    return {int(child) for task in tasks for child in task.read_text().split()}
+
+
+def wait_until(condition) -> None:
+    deadline_s = time.monotonic() + WAIT_S
+    while not condition():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.05)
+
+
+def ask(file: Path, start_s: float | None) -> Film:
+    """Return a visitor's request for the depth of a film."""
+    return Film(
+        files=(file,),
+        format="side_by_side",
+        output="depth",
+        start_s=start_s,
+        backend=Backend(),
+        name_of=label_of,
+    )
+
+
+def begin_endless(visit: Visit, film: Path, pid: int) -> set[int]:
+    """Begin to convert a film without end; return the process that does it."""
+    visit.open("Film")
+    visit.give(film_left=film)
+    before = workers_of(pid)
+    visit.page.click("#film-whole")
+    visit.page.locator("#film-status").get_by_text(AT_WORK).wait_for()
+    return workers_of(pid) - before or workers_of(pid)
+
+
+def test_two_visitors_work_at_once_and_cancelling_ends_one_job(server, browser, large_pair, pair):
+    pid, address = server
+    with visiting(browser, address) as patient, visiting(browser, address) as quick:
+        patient.give(**large_pair)
+        patient.page.get_by_label("finest").check()
+        patient.page.click("#find")
+        patient.page.locator("#status").get_by_text("matching 2560×1920 px").wait_for()
+        quick.give(**pair)
+        assert f"{WIDTH}×{HEIGHT} px, matched in" in quick.find()
+        assert patient.page.locator("#status .notice").count() == 0  # still at work
+        before = workers_of(pid)
+        assert len(before) == 2
+        patient.page.click("#cancel")
+        patient.page.locator("#status").get_by_text("Cancelled").wait_for()
+        wait_until(lambda: len(before - workers_of(pid)) == 1)
+        patient.take_back()
+        patient.give(**pair)
+        patient.page.get_by_label("fast").check()
+        assert f"{WIDTH}×{HEIGHT} px, matched in" in patient.find()
+        assert not patient.page.locator("#cancel").is_enabled()
+
+
+def test_after_cancelling_the_result_before_stays(visit, pair, large_pair):
+    visit.give(**pair)
+    visit.find()
+    visit.take_back()
+    visit.give(**large_pair)
+    visit.page.get_by_label("finest").check()
+    visit.page.click("#find")
+    visit.page.locator("#status").get_by_text("matching 2560×1920 px").wait_for()
+    visit.page.click("#cancel")
+    visit.page.locator("#status").get_by_text("Cancelled").wait_for()
+    assert visit.move("0.25").shape == (HEIGHT, WIDTH, 3)
+    visit.open("Files")
+    assert visit.page.locator("#files a").count() > 5
+    assert "Cancelled" in visit.page.locator("#status").inner_text()
+
+
+def test_a_closed_tab_ends_its_film_and_the_next_visitor_s_begins(server, browser, endless_film, tmp_path):
+    pid, address = server
+    with visiting(browser, address) as leaving:
+        begin_endless(leaving, endless_film, pid)
+        busy = workers_of(pid)
+    with visiting(browser, address) as next_one:
+        wait_until(lambda: busy - workers_of(pid))
+        begin_endless(next_one, endless_film, pid)
+        next_one.page.click("#film-cancel")
+        next_one.page.locator("#film-status").get_by_text("Cancelled").wait_for()
+
+
+def test_a_waiting_job_can_be_cancelled(server, browser, endless_film):
+    pid, address = server
+    with visiting(browser, address) as first, visiting(browser, address) as second:
+        begin_endless(first, endless_film, pid)
+        second.open("Film")
+        second.give(film_left=endless_film)
+        second.page.click("#film-preview")
+        second.page.locator("#film-status").get_by_text("queue").wait_for()
+        second.page.click("#film-cancel")
+        second.page.locator("#film-status").get_by_text("Cancelled").wait_for()
+        first.page.locator("#film-status").get_by_text(AT_WORK).wait_for()
+
+
+# By kind: the picture's format, and its width and height.
+STILLS = {
+    "side_by_side": ("JPEG", (2 * WIDTH, HEIGHT)),
+    "side_by_side_half": ("JPEG", (WIDTH, HEIGHT)),
+    "crossed": ("JPEG", (2 * WIDTH, HEIGHT)),
+    "top_bottom": ("JPEG", (WIDTH, 2 * HEIGHT)),
+    "top_bottom_half": ("JPEG", (WIDTH, HEIGHT)),
+    "anaglyph_dubois": ("JPEG", (WIDTH, HEIGHT)),
+    "anaglyph_half_colour": ("JPEG", (WIDTH, HEIGHT)),
+    "anaglyph_colour": ("JPEG", (WIDTH, HEIGHT)),
+    "anaglyph_grey": ("JPEG", (WIDTH, HEIGHT)),
+    "wiggle": ("GIF", (WIDTH, HEIGHT)),
+    "sweep": ("WEBP", (WIDTH, HEIGHT)),
+    "mpo": ("MPO", (WIDTH, HEIGHT)),
+    "jps": ("JPEG", (2 * WIDTH, HEIGHT)),
+    "quilt": ("JPEG", (8 * WIDTH, 6 * HEIGHT)),
+    "contact_sheet": ("JPEG", (WIDTH // 3 * 3, HEIGHT // 3 * 3)),
+    "rgbd": ("JPEG", (2 * WIDTH, HEIGHT)),
+    "depth_map": ("PNG", (WIDTH, HEIGHT)),
+}
+FRAMES = {"wiggle": 12, "sweep": 80, "mpo": 2}
+
+
+@pytest.fixture(scope="module")
+def answered(browser, server, pair) -> Iterator[Visit]:
+    """Yield a visitor who has the small pair's result and looks at its 3-D pictures."""
+    with visiting(browser, server[1]) as visit:
+        visit.give(**pair)
+        visit.find()
+        visit.open("3-D picture")
+        visit.page.locator("#picture").get_by_text("anaglyph_dubois").wait_for()
+        yield visit
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_each_3_d_picture_opens_with_its_format_and_size(answered, kind, tmp_path):
+    answered.choose("kind", KINDS[kind].label)
+    answered.page.locator("#viewing").get_by_text(KINDS[kind].viewing).wait_for()
+    stem = "picture" if kind in ("mpo", "jps") else kind
+    answered.page.locator("#picture").get_by_text(f" {stem}").wait_for()
+    file = answered.download("picture", tmp_path)
+    with Image.open(file) as picture:
+        assert (picture.format, picture.size) == STILLS[kind]
+        assert getattr(picture, "n_frames", 1) == FRAMES.get(kind, 1)
+    assert answered.picture("preview").std() > 10
+
+
+@pytest.mark.parametrize("kind", ["wiggle", "sweep"])
+def test_an_animation_moves_in_its_preview(answered, kind):
+    answered.choose("kind", KINDS[kind].label)
+    answered.page.locator("#picture").get_by_text(f" {kind}").wait_for()
+    with Image.open(io.BytesIO(answered.fetch("preview"))) as preview:
+        assert getattr(preview, "n_frames", 1) == FRAMES[kind]
+
+
+def test_the_halves_of_a_crossed_picture_are_the_right_and_the_left_view(answered, pair, tmp_path):
+    answered.choose("kind", KINDS["crossed"].label)
+    answered.page.locator("#picture").get_by_text(" crossed").wait_for()
+    crossed = read_image(answered.download("picture", tmp_path)).astype(float)
+    for side, half in zip(("right", "left"), np.split(crossed, 2, axis=1), strict=True):
+        assert np.abs(half - read_image(pair[side])).mean() < 5
+
+
+def test_five_seconds_of_a_film_are_shown_as_a_preview(visit, tmp_path):
+    film = write_video(tmp_path / "film.mp4", [packed(*pair) for pair in example_pairs(50)] * 4)  # 8 s
+    visit.open("Film")
+    visit.give(film_left=film)
+    visit.choose("film-output", "Anaglyph")
+    visit.page.locator("#film-start input").fill("2")
+    visit.page.click("#film-preview")
+    visit.page.locator("#film-status").get_by_text("125 frames of 160×96 px, 5.0 s").wait_for()
+    visit.page.wait_for_function("document.querySelector('#film video')?.videoWidth === 160")
+    assert visit.page.evaluate("document.querySelector('#film video').duration") == pytest.approx(5, abs=0.05)
+    with av.open(str(visit.download("film-file", tmp_path))) as shown:
+        frames = [frame.to_ndarray(format="rgb24") for frame in shown.decode(video=0)]
+    assert len(frames) == 125
+    assert visit.refused == []
+
+
+def test_a_file_that_is_no_film_is_one_line(visit, tmp_path):
+    (tmp_path / "notes.mp4").write_text("no film")
+    visit.open("Film")
+    visit.page.click("#film-preview")
+    said = visit.page.locator("#film-status .notice.problem")
+    said.get_by_text("expected a film with both views, or a left and a right film, found none").wait_for()
+    visit.give(film_left=tmp_path / "notes.mp4")
+    visit.page.click("#film-preview")
+    said.get_by_text("notes.mp4: expected ").wait_for()
+    assert "/" not in said.inner_text()
+
+
+def test_a_film_s_frames_and_the_time_left_are_reported(tmp_path):
+    film = write_video(tmp_path / "film.mp4", [packed(*pair) for pair in example_pairs(6)])
+    said: list[tuple[float, str]] = []
+    made = convert_film(ask(film, start_s=0.08), tmp_path, lambda share, what: said.append((share, what)))
+    shares, texts = zip(*said, strict=True)
+    assert list(shares) == sorted(shares)
+    assert texts[-4] == "frame 1 of 4"
+    assert re.fullmatch(r"frame 4 of 4, about \d+ (s|min|h) left", texts[-1])
+    assert re.search(
+        r"4 frames of 160×96 px, 0.2 s.*The whole film takes about \d+ (s|min|h)\.", made.summary
+    )
+    assert made.warnings == []
+
+
+@pytest.mark.parametrize("ending", ["m3u8", "mp4", "ffconcat"])
+def test_a_playlist_does_not_read_another_film(tmp_path, ending):
+    secret = write_video(tmp_path / "secret.mp4", [packed(*pair) for pair in example_pairs(5)])
+    playlist = tmp_path / f"playlist.{ending}"
+    if ending == "ffconcat":
+        playlist.write_text("ffconcat version 1.0\nfile secret.mp4\n")
+    else:
+        playlist.write_text(f"#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\n{secret}\n#EXT-X-ENDLIST\n")
+    with pytest.raises(FormatError, match=rf"^playlist\.{ending}: expected a film \(MP4.*found another kind"):
+        convert_film(ask(playlist, start_s=None), tmp_path, lambda share, what: None)
+
+
+def test_pictures_that_do_not_fit_get_a_banner(visit, tmp_path):
+    left, right = (read_image(TEXTURED / f"{side}.png") for side in ("left", "right"))
+    write_image(tmp_path / "left.png", left)
+    write_image(tmp_path / "right.png", np.roll(right, 12, axis=0))
+    visit.give(left=tmp_path / "left.png", right=tmp_path / "right.png")
+    visit.find()
+    banner = visit.page.locator("#status .warning")
+    assert "“Align the pictures”" in banner.inner_text()
+    assert banner.get_attribute("role") == "alert"
