@@ -25,6 +25,7 @@ _LABELS = {
     "focal_px": "Focal length, px",
     "model": "Quality",
     "rectify": "Align the pictures",
+    "no_rectify": "Align the pictures",
 }
 label_of = partial(name_setting, _LABELS)
 
@@ -36,13 +37,14 @@ class PairForm:
         self.left = gr.File(label="Left picture, or one file with both views", height=160, elem_id="left")
         self.right = gr.File(label="Right picture", height=160, elem_id="right")
         self.rectify = gr.Checkbox(
+            value=True,
             label=_LABELS["rectify"],
-            info="For pictures taken by hand or by two separate cameras. Not for 3-D films and 3-D cameras.",
+            info="Only where needed: pictures taken by hand, or left and right swapped.",
             elem_id="rectify",
         )
         self.model = gr.Radio(
             MODELS,
-            value="small",
+            value="best",
             label=_LABELS["model"],
             info="Finer takes longer: fine 2 times, finest 5 times.",
             elem_id="model",
@@ -70,8 +72,8 @@ class PairForm:
             self.left: str(folder / "left.jpg"),
             self.right: str(folder / "right.jpg"),
             self.calibration: str(folder / "calib.txt"),
-            self.model: "small",
-            self.rectify: False,
+            self.model: "best",
+            self.rectify: True,
             self.layout: _DETECTED,
             self.focal_px: 0,
             self.baseline_mm: 0,
@@ -80,12 +82,13 @@ class PairForm:
     def read(self, given: dict[Any, Any], provider: str) -> Uploads:
         """Return the uploads and settings that a visitor has given."""
         calibration, baseline_mm = given[self.calibration], given[self.baseline_mm] or None
+        where_needed = True if calibration else None
         request = Request(
             format=read_layout(given[self.layout]),
             calibration=Path(calibration) if calibration else None,
             focal_px=given[self.focal_px] or None,
             baseline_m=baseline_mm and baseline_mm / 1000,
-            rectify=given[self.rectify],
+            rectify=where_needed if given[self.rectify] else False,
         )
         pictures = tuple(Path(file) for file in (given[self.left], given[self.right]) if file)
         backend = Backend(model=given[self.model], provider=provider)

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from stereoweave.arguments import check_number
+from stereoweave.arguments import check_kind, check_number
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.arrays import ImageLike, as_rgb
 from stereoweave.matching.exposure import match_exposure, recolour
@@ -184,6 +184,7 @@ def render(  # noqa: PLR0913 - the options of one view
     Raises:
         ValueError: The sizes differ, or a number is out of range.
     """
+    check_kind("estimate", estimate, Estimate)
     given = estimate.pair or StereoPair(left=as_rgb(left, "left"), right=as_rgb(right, "right"))
     pair = replace(given, camera=camera)
     renderer = Renderer(pair, estimate, strength=strength, convergence_px=convergence_px, threads=threads)

@@ -22,7 +22,7 @@ ERRORS: dict[str, tuple[dict[str, str], dict[str, Any]]] = {
     "“Layout of a single file”: expected one picture that holds both views, found two, left.png and "
     "right.png; omit this setting, and give the left picture first": (PAIR, {"layout": "crossed"}),
     "turned.yml: expected a calibration of rectified pictures, found lenses with distortion; rectify the "
-    "pair with it (“Align the pictures”)": ({**PAIR, "calibration": "turned.yml"}, {}),
+    "pair with it (“Align the pictures”)": ({**PAIR, "calibration": "turned.yml"}, {"rectify": False}),
     "metres: expected a baseline besides the focal length, found none in EXIF; give the baseline "
     "(“Baseline, mm”)": (
         PAIR,
@@ -30,22 +30,15 @@ ERRORS: dict[str, tuple[dict[str, str], dict[str, Any]]] = {
     ),
     "metres: expected a focal length besides the baseline, found none in EXIF; give the focal length "
     "(“Focal length, px”)": (PAIR, {"baseline": 100}),
-    "“Align the pictures”: expected at least 40 feature matches that agree on the camera positions, "
-    "found 0 of 0 matches; photograph a scene with more texture and with more overlap; or give a "
-    "calibration (“Calibration file, for metres”)": (
-        {"left": "plain.png", "right": "plain.png"},
-        {"rectify": True},
-    ),
 }
 NOTES: dict[str, tuple[dict[str, str], dict[str, Any]]] = {
     "side_by_side, detected from name and content; override it if it is wrong (“Layout of a single file”)": (
         {"left": "both.png"},
         {},
     ),
-    "no depth in metres after rectification from feature matches; give a calibration (“Calibration file, for "
-    "metres”)": (
-        PAIR,
-        {"focal": 600, "baseline": 100, "rectify": True},
+    "the right picture is 2.0 px lower than the left one; rectify the pair (“Align the pictures”)": (
+        {"left": "upper.png", "right": "lower.png"},
+        {"rectify": False},
     ),
 }
 
@@ -78,3 +71,9 @@ def test_an_error_names_settings_by_their_label(say, text):
 @pytest.mark.parametrize("text", NOTES)
 def test_a_note_names_settings_by_their_label(say, text):
     assert text in say(*NOTES[text])
+
+
+def test_an_aligned_pair_is_told_so_with_the_label_that_keeps_it(say):
+    (line,) = [line for line in say({"left": "upper.png", "right": "lower.png"}, {}) if "rectified" in line]
+    assert line.startswith("rectified with ")
+    assert line.endswith("(2.00 px before); keep the pictures as they are (“Align the pictures”)")

@@ -77,7 +77,7 @@ class Visitor:
     def press(self, button: str = "find", **given: Any) -> dict[str, Any]:
         """Return the request body for a button of the form, with some fields filled in."""
         number, inputs = self._inputs[button]
-        form = {"model": "small", "rectify": False, "layout": "detected", "position": 0.5} | given
+        form = {"model": "small", "rectify": True, "layout": "detected", "position": 0.5} | given
         data = [form.get(self._fields[part]) for part in inputs]
         return {"data": data, "fn_index": number, "session_hash": uuid4().hex}
 
