@@ -1,12 +1,13 @@
 """Reading and writing pictures."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8, UInt16
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io.decoding import read_picture
@@ -90,12 +91,19 @@ def picture_kind(path: str | Path) -> str:
 
 
 def save_picture(
-    path: str | Path, values: UInt8[np.ndarray, "h w *channels"] | UInt16[np.ndarray, "h w"], kind: str
+    path: str | Path,
+    values: UInt8[np.ndarray, "h w *channels"] | UInt16[np.ndarray, "h w"],
+    kind: str,
+    *,
+    texts: Mapping[str, str] | None = None,
 ) -> None:
-    """Write values as a picture; `kind` is Pillow's name for the format."""
+    """Write values as a picture; `kind` is Pillow's name for the format, `texts` a PNG's text chunks."""
+    chunks = PngInfo()
+    for key, text in (texts or {}).items():
+        chunks.add_text(key, text)
     with replacing(path) as temporary, checking_format_size(path, values.shape):
         # Level 3 takes a third as long as Pillow's default, 6, and gives 5 % more bytes (at 741x500 px).
-        Image.fromarray(values).save(temporary, kind, quality=95, compress_level=3)
+        Image.fromarray(values).save(temporary, kind, quality=95, compress_level=3, pnginfo=chunks)
 
 
 @contextmanager
