@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -32,12 +33,14 @@ _MIDDLE = 0.5
 
 
 Out = Annotated[
-    Path,
+    Path | None,
     typer.Option(
         "--out",
         "-o",
-        help="File to write. Viewers recognise some layouts by a mark in the file name, which is added "
-        "automatically: view.png becomes view_qs8x6a0.75.png for a quilt. .mpo and .jps are 3-D pictures.",
+        help="File to write (default: in the current folder, named after the left picture and the layout, "
+        "such as left_view.png or left_wiggle.webp). Viewers recognise some layouts by a mark in the file "
+        "name, which is added automatically: view.png becomes view_qs8x6a0.75.png for a quilt. .mpo and .jps "
+        "are 3-D pictures.",
     ),
 ]
 Position = Annotated[
@@ -79,7 +82,7 @@ Calib = Annotated[
 
 def view(  # noqa: PLR0913 - each is an option of the command line
     pictures: Pictures,
-    out: Out,
+    out: Out = None,
     position: Position = None,
     up: Up = 0.0,
     forward: Forward = 0.0,
@@ -108,6 +111,7 @@ def view(  # noqa: PLR0913 - each is an option of the command line
     from stereoweave.rendering import layouts
     from stereoweave.rendering.renderer import Renderer, check_position
 
+    out = out or _name_view(pictures, layout)
     name = layouts.choose_layout(out, layout)
     _check_unused(name, {"--position": position, "--up": up or None, "--forward": forward or None}, quilt)
     if strength != 1 or convergence is not None:
@@ -134,6 +138,14 @@ def view(  # noqa: PLR0913 - each is an option of the command line
     typer.echo(f"{out}: {written}")
     for note in (*prepared.notes, *find_problems(pair, estimate)):
         typer.echo(note.format(running_options()))
+
+
+def _name_view(pictures: Sequence[Path], layout: str | None) -> Path:
+    """Return the file to write if the user names none."""
+    from stereoweave.rendering.layouts import ANIMATIONS
+
+    ending = ".webp" if layout in ANIMATIONS else ".png"
+    return Path(f"{pictures[0].stem}_{layout or 'view'}{ending}")
 
 
 def _check_unused(name: str | None, single_view: dict[str, float | None], quilt: str | None) -> None:
