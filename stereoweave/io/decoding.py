@@ -32,6 +32,7 @@ ENDINGS = frozenset(
 # Not all of Pillow's formats: a PostScript file, for example, would run as a program. JPEG includes MPO and
 # JPS.
 _KINDS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "GIF", "PPM", "AVIF", "JPEG2000")
+_ANIMATIONS = ("GIF", "PNG", "WEBP", "AVIF")
 _RAW_ENDINGS = {
     *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dng", ".erf", ".iiq", ".kdc", ".mrw", ".nef", ".nrw", ".orf"),
     *(".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw", ".x3f"),
@@ -76,7 +77,7 @@ def open_picture(path: Path, *, views: int = 1, expected: str = A_PICTURE) -> It
         picture = _open(path, path, views)
     with picture:
         check_size(path, picture.size, views=views)
-        _refuse_by_content(path, picture)
+        _refuse_by_content(path, picture, views)
         yield picture
 
 
@@ -195,8 +196,8 @@ def _refuse_by_name(path: Path, head: bytes) -> None:
         raise FormatError(f"{path}: expected {A_PICTURE}, found a video; use 'stereoweave video'")
 
 
-def _refuse_by_content(path: Path, picture: Any) -> None:
-    """Raise a FormatError for a panorama, a VR180 picture or an animation."""
+def _refuse_by_content(path: Path, picture: Any, views: int) -> None:
+    """Raise a FormatError for a panorama, a VR180 picture or an animation of more frames than views."""
     description = picture.info.get("xmp", b"")
     words = description if isinstance(description, bytes) else str(description).encode(errors="replace")
     if b"GImage:" in words or b"equirectangular" in words.lower():
@@ -204,14 +205,21 @@ def _refuse_by_content(path: Path, picture: Any) -> None:
             f"{path}: expected an ordinary picture, found a VR180 picture or a 360-degree panorama "
             "(according to its XMP metadata); export two ordinary views from it"
         )
-    if picture.format in ("GIF", "PNG", "WEBP", "AVIF"):
-        with _decoding(path):
-            count = picture.n_frames
-        if count > 1:
-            raise FormatError(
-                f"{path}: expected one picture, found an animation of {count} frames; "
-                "save its two views as separate pictures"
-            )
+    count = _count_frames(path, picture)
+    if count > views:
+        wanted = "one picture" if views == 1 else "one picture, or an animation of two frames, left and right"
+        raise FormatError(
+            f"{path}: expected {wanted}, found an animation of {count} frames; "
+            "save its two views as separate pictures"
+        )
+
+
+def _count_frames(path: Path, picture: Any) -> int:
+    """Return the number of frames of an animation, or 1; other formats hold other pictures in more frames."""
+    if picture.format not in _ANIMATIONS:
+        return 1
+    with _decoding(path):
+        return int(picture.n_frames)
 
 
 def _to_eight_bits(path: Path, picture: Image.Image) -> Image.Image:
@@ -262,7 +270,12 @@ def _clean_text(text: str) -> str:
 
 
 def find_view_frames(path: Path, picture: Any) -> list[int]:
-    """Return the indices of the two frames that hold an MPO file's views; empty if there is only one view."""
+    """Return the indices of the two frames that hold an MPO file's views, or those of a two-frame animation.
+
+    The list is empty if there is only one view.
+    """
+    if picture.format in _ANIMATIONS:
+        return [0, 1] if _count_frames(path, picture) == 2 else []
     if picture.format != "MPO":
         return []
     with _decoding(path):
@@ -280,7 +293,7 @@ def find_view_frames(path: Path, picture: Any) -> list[int]:
 
 
 def read_frame(path: Path, picture: Image.Image, index: int) -> DecodedPicture:
-    """Decode a frame of an MPO file."""
+    """Decode a frame of an MPO file or an animation."""
     _seek(path, picture, index)
     check_size(path, picture.size)
     decoded = decode(path, picture)
@@ -289,7 +302,7 @@ def read_frame(path: Path, picture: Image.Image, index: int) -> DecodedPicture:
 
 
 def _seek(path: Path, picture: Image.Image, index: int) -> None:
-    """Seek to a frame of an MPO file and drop the tags and the profile of the previous frame."""
+    """Seek to a frame, and drop the tags and the profile of the previous one."""
     if picture.tell() == index:
         return
     for key in ("mp", "icc_profile"):
@@ -299,6 +312,6 @@ def _seek(path: Path, picture: Image.Image, index: int) -> None:
             picture.seek(index)
     except Exception as error:  # a damaged file may raise any exception, as in `_decoding`
         raise FormatError(
-            f"{path}: expected an undamaged MPO file, found that picture {index + 1} is truncated or damaged "
-            f"({_clean_text(str(error))})"
+            f"{path}: expected an undamaged {picture.format} file, found that picture {index + 1} is "
+            f"truncated or damaged ({_clean_text(str(error))})"
         ) from error

@@ -17,8 +17,8 @@ NO_CAMERA = (
 )
 ERRORS = {
     "depth left.png -o out": "left.png: expected a stereo picture, two views side by side or one above the "
-    "other, found halves that do not resemble each other; give two files, left and right; or choose one of "
-    f"{LAYOUTS} (--format)",
+    "other, found what looks like a single photograph (its halves do not resemble each other); give two "
+    f"files, left and right; or choose one of {LAYOUTS} (--format)",
     f"depth {PAIR} --format crossed -o out": "--format: expected one picture that holds both views, found "
     "two, left.png and right.png; omit this setting, and give the left picture first",
     "view both.png --format diagonal -o out.png": f"--format: expected one of {LAYOUTS}, mpo, jps, found "
