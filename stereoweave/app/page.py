@@ -4,7 +4,6 @@ The page also has a slider to move the viewpoint, a point cloud, distance measur
 """
 
 import html
-import importlib.resources
 import re
 import shutil
 import tempfile
@@ -35,6 +34,7 @@ from stereoweave.matching.backend import Backend
 from stereoweave.matching.providers import CPU
 from stereoweave.pictures.loading import FORMATS
 from stereoweave.pictures.prepare import Request
+from stereoweave.pictures.sample import sample_folder
 
 _LIFETIME_S = 3600
 # Each session keeps its last result. It takes 60 MB plus 19 bytes per pixel of the left picture in memory
@@ -380,8 +380,3 @@ def _describe_position(position: float) -> str:
     if position < 0:
         return "left of the left camera"
     return "right of the right camera" if position > 1 else "between the cameras"
-
-
-def sample_folder() -> Path:
-    """Return the folder that contains the sample pair."""
-    return Path(str(importlib.resources.files("stereoweave"))) / "sample"

@@ -16,8 +16,9 @@ from fastapi import FastAPI
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 
 from stereoweave.app.access import ContentPolicy, OwnFiles
-from stereoweave.app.page import Page, sample_folder
+from stereoweave.app.page import Page
 from stereoweave.matching.providers import CPU
+from stereoweave.pictures.sample import sample_folder
 
 _MOST_BYTES = 200 * 1024**2
 

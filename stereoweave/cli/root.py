@@ -12,6 +12,7 @@ from stereoweave.cli.app import app as page
 from stereoweave.cli.batch import batch
 from stereoweave.cli.bench import bench
 from stereoweave.cli.commands import Commands
+from stereoweave.cli.demo import demo
 from stereoweave.cli.depth import depth, measure
 from stereoweave.cli.live import live
 from stereoweave.cli.rig import calibrate, check, rectify
@@ -63,7 +64,7 @@ def _stereoweave(
     """Handle the options of the command `stereoweave` itself."""
 
 
-for command in (depth, measure, view, video, live, check, rectify, calibrate, serve, batch):
+for command in (demo, depth, measure, view, video, live, check, rectify, calibrate, serve, batch):
     app.command()(command)
 app.command("app")(page)
 app.command()(train)
