@@ -19,6 +19,7 @@ from PIL import Image, UnidentifiedImageError, features
 
 from stereoweave.errors import FormatError, reason
 from stereoweave.io import exif
+from stereoweave.io.similar_names import describe_missing
 from stereoweave.stereo import LONGEST_SIDE_PX
 
 # 50 megapixels per view are supported; cameras of that class have up to 64. The limit is checked against the
@@ -119,10 +120,16 @@ def check_regular(path: Path, expected: str) -> None:
     """Raise a FormatError unless the path is a regular file; pipes may block, and devices may be endless."""
     try:
         mode = path.stat().st_mode
+    except FileNotFoundError as error:
+        raise FormatError(f"{path}: expected {expected}, found {describe_missing(path)}") from error
     except (OSError, ValueError) as error:  # ValueError: a name with a zero byte
         raise FormatError(f"{path}: expected {expected}, found {reason(error)}") from error
     if not stat.S_ISREG(mode):
-        found = "a folder" if stat.S_ISDIR(mode) else "a pipe or a device; copy it into a file first"
+        found = (
+            "a folder; give the files in it"
+            if stat.S_ISDIR(mode)
+            else "a pipe or a device; copy it into a file first"
+        )
         raise FormatError(f"{path}: expected {expected}, found {found}")
 
 
@@ -155,9 +162,18 @@ def _decoding(path: str | Path, expected: str = A_PICTURE) -> Iterator[None]:
     except FormatError:
         raise
     except UnidentifiedImageError as error:
-        raise FormatError(f"{path}: expected {expected}, found another type of file") from error
+        raise FormatError(f"{path}: expected {expected}, found {_describe_other(path)}") from error
     except Exception as error:
         raise FormatError(f"{path}: expected {expected}, found {reason(error)}") from error
+
+
+def _describe_other(path: str | Path) -> str:
+    """Return what a file is that Pillow does not recognise as a picture."""
+    try:
+        is_empty = Path(path).stat().st_size == 0
+    except OSError:  # the content is part of another file
+        is_empty = False
+    return "an empty file; copy it again" if is_empty else "another type of file; save it as PNG or JPEG"
 
 
 def _open(path: str | Path, source: Path | io.BytesIO, views: int) -> Image.Image:

@@ -67,10 +67,11 @@ def make_pair(
     for path, image in ((left, left_image), (right, right_image)):
         check_large_enough(path, image)
     if left_image.shape != right_image.shape:
+        is_turned = left_image.shape[:2] == right_image.shape[1::-1]
+        remedy = "turn one of them upright" if is_turned else "crop or rescale one of them"
         raise FormatError(
             f"expected left and right pictures of the same size, found {left} with "
-            f"{_format_size(left_image)} and {right} with {_format_size(right_image)} pixels; "
-            "crop or rescale one of them"
+            f"{_format_size(left_image)} and {right} with {_format_size(right_image)} pixels; {remedy}"
         )
     return StereoPair(left=left_image, right=right_image)
 

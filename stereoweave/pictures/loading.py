@@ -90,7 +90,8 @@ def open_pictures(paths: Sequence[Path], format: str | None = None) -> Opened:
             return _open_one(both, format)
     names = " ".join(map(str, paths))
     raise StereoweaveError(
-        f"expected two pictures, left and right, or one that holds both views, found {len(paths)}: {names}"
+        f"expected two pictures, left and right, or one that holds both views, found {len(paths)}: {names}",
+        remedy=Remedy("if one of them is the output, name it as such", ("out",)) if paths else None,
     )
 
 

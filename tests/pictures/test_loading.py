@@ -649,7 +649,7 @@ def box(*brands):
         ("a.dng", b"II\x2a\0", "a camera raw file"),
         ("a.jpg", b"PK\x03\x04" + bytes(1000), "another type of file"),
         ("a.jpg", b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 90 90\n", "another type of file"),
-        ("a.jpg", b"", "another type of file"),
+        ("a.jpg", b"", "an empty file; copy it again"),
     ],
 )
 def test_what_is_not_read_is_refused_by_its_name(tmp_path, name, content, found):
