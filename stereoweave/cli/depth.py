@@ -206,7 +206,9 @@ def _print_summary(summary: "Summary", notes: list[str], out: Path) -> None:
         f"{' + '.join(summary.pictures)}: {size}, matched by {summary.model} in {summary.estimate_ms:.0f} ms"
     )
     ranges = [f"disparity {summary.disparity_p1_px:.1f} to {summary.disparity_p99_px:.1f} px"]
-    if summary.camera:
+    if summary.camera and summary.depth_p1_m is None:
+        ranges.append("depth infinite")
+    elif summary.camera:
         ranges.append(f"depth {_format_m(summary.depth_p1_m)} to {_format_m(summary.depth_p99_m)}")
     typer.echo(f"{', '.join(ranges)} (98 % of the pixels)")
     for note in notes:

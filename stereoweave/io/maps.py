@@ -167,6 +167,11 @@ def find_scale(low_px: float, high_px: float) -> tuple[float, float] | None:
     return max(_STEP_PX, 2.0 ** math.ceil(math.log2((high_px - offset_px) / _MOST_STEPS))), offset_px
 
 
+def format_scale(scale_px: float, offset_px: float) -> str:
+    """Return the formula that gives the disparity in px, such as "value / 256 - 45"."""
+    return f"value / {1 / scale_px:g} {'-' if offset_px < 0 else '+'} {abs(offset_px):g}"
+
+
 def write_scaled_disparity_png(path: str | Path, disparity_px: Float[np.ndarray, "h w"]) -> None:
     """Write disparities of any range as a 16-bit PNG; NaN and infinity become 0 (unknown).
 

@@ -20,7 +20,7 @@ from stereoweave.io.colormap import (
     find_colour_range_px,
     legend_colours,
 )
-from stereoweave.io.maps import find_scale
+from stereoweave.io.maps import find_scale, format_scale
 from stereoweave.io.text import writing_text
 from stereoweave.rendering.renderer import Renderer
 from stereoweave.stereo import Estimate, StereoCamera, StereoPair
@@ -231,9 +231,9 @@ def _list_numbers(summary: Summary) -> list[tuple[str, str]]:
         ),
         ("Median disparity", f"{summary.disparity_median_px:.1f} px"),
     ]
-    if summary.disparity_scale_px is not None:
-        formula = f"value × {summary.disparity_scale_px:g} px {summary.disparity_offset_px:+g} px"
-        rows.append(("Disparity in disparity_scaled.png", formula))
+    if summary.disparity_scale_px is not None and summary.disparity_offset_px is not None:
+        formula = format_scale(summary.disparity_scale_px, summary.disparity_offset_px)
+        rows.append(("In disparity_scaled.png", f"{formula} px"))
     if summary.camera:
         rows += [
             (

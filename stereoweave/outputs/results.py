@@ -23,6 +23,7 @@ from stereoweave.io.files import make_folder, make_parent_folder, reading
 from stereoweave.io.images import write_image
 from stereoweave.io.maps import (
     RangeError,
+    format_scale,
     write_depth_png,
     write_disparity_png,
     write_float_tiff,
@@ -210,13 +211,12 @@ def write_files(folder: Path, files: Sequence[str], result: Result) -> list[Note
 
 
 def _note_scaled(summary: Summary) -> Note:
+    low_px, high_px = summary.disparity_min_px, summary.disparity_max_px
+    assert summary.disparity_scale_px is not None and summary.disparity_offset_px is not None
+    formula = format_scale(summary.disparity_scale_px, summary.disparity_offset_px)
     return Note(
-        f"no disparity.png: expected disparities of 0 to 255.99 px, found {summary.disparity_min_px:.2f} to "
-        f"{summary.disparity_max_px:.2f} px",
-        Remedy(
-            f"use disparity.pfm, or {SCALED}, whose values times {summary.disparity_scale_px:g} "
-            f"{summary.disparity_offset_px:+g} are pixels"
-        ),
+        f"no disparity.png: expected disparities of 0 to 255.99 px, found {low_px:.2f} to {high_px:.2f} px",
+        Remedy(f"use disparity.pfm, or {SCALED}, in which px = {formula}"),
     )
 
 

@@ -361,7 +361,7 @@ def test_a_disparity_that_a_png_cannot_hold_gets_a_note_instead_of_a_png(picture
     printed, _ = capfd.readouterr()
     text = "no disparity.png: expected disparities of 0 to 255.99 px"
     (note,) = [line for line in printed.splitlines() if text in line]
-    assert " px; use disparity.pfm, or disparity_scaled.png, whose values times 0.00390625 " in note
+    assert " px; use disparity.pfm, or disparity_scaled.png, in which px = value / 256 " in note
     assert not Path("out/disparity.png").exists()
     # The photographs do not show this disparity, so refinement moves it by at most 1 px.
     np.testing.assert_allclose(read_pfm("out/disparity.pfm"), disparity_px, atol=1.001)

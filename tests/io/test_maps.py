@@ -117,6 +117,8 @@ def test_a_scaled_png_holds_negative_and_large_disparities_with_scale_and_offset
     with Image.open(path) as picture:
         assert picture.text == {"disparity_scale_px": "0.015625", "disparity_offset_px": "-5.0"}
     np.testing.assert_array_equal(stored(path), [[1.5 * 64, 5 * 64, 605 * 64, 0]])
+    assert maps.format_scale(0.015625, -5.0) == "value / 64 - 5"
+    assert maps.format_scale(0.25, 7.0) == "value / 4 + 7"
 
 
 @pytest.mark.parametrize(("low_px", "high_px"), [(-0.6, 40), (-640, 640), (300, 301), (0, 32766), (0, 255)])
