@@ -12,7 +12,7 @@ Out = Annotated[Path, typer.Option("--out", "-o", help="Folder to write the resu
 
 
 def demo(out: Out = Path("demo")) -> None:
-    """Compute depth, a report and a new view of a sample pair, and say what to open next."""
+    """Show depth and a new view of a sample pair. Says which file to open next."""
     from stereoweave.pictures.sample import sample_folder
 
     folder = sample_folder()
