@@ -83,6 +83,8 @@ _NARROWEST_EYE, _WIDEST_EYE = 1.2, 2.5
 # horizontal to vertical contrast between neighbouring pixels decides. Its median over painted pictures is
 # 0.96 for full views, 1.58 for half width and 0.57 for half height.
 _UPRIGHT_EYE, _LOW_EYE, _LOWEST_EYE, _SQUEEZED_CONTRAST = 0.525, 2.0, 3.0, 1.25
+# Nearly square pictures more often hold half-width views than views as tall as these, unless they are 9:16.
+_TALL_EYE, _SQUEEZED_CONTRAST_OF_TALL, _PHONE = 0.6, 1.0, 9 / 16
 _SCREEN, _SCREEN_TOLERANCE = 16 / 9, 0.01
 _DETAIL_PX = 480
 # Limits of a whole frame's aspect ratio. Two upright phone pictures side by side have at least the first; two
@@ -237,7 +239,9 @@ def _looks_squeezed_photograph(kind: str, frame: Frame) -> bool:
         if abs(width_px / height_px / _SCREEN - 1) < _SCREEN_TOLERANCE:
             return True
         if _UPRIGHT_EYE <= aspect < _NARROWEST_EYE:
-            return _measure_contrast_ratio(kind, frame) > _SQUEEZED_CONTRAST
+            is_tall = aspect < _TALL_EYE and abs(aspect / _PHONE - 1) > _SCREEN_TOLERANCE
+            least = _SQUEEZED_CONTRAST_OF_TALL if is_tall else _SQUEEZED_CONTRAST
+            return _measure_contrast_ratio(kind, frame) > least
         return aspect < _UPRIGHT_EYE
     aspect = 2 * width_px / height_px
     if _LOW_EYE < aspect < _LOWEST_EYE:

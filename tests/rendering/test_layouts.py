@@ -254,7 +254,8 @@ def test_a_layout_is_chosen_by_name_or_by_the_file_s_ending(path, name, expected
         ("view.jps", "quilt", r"view\.jps: expected the layout crossed .* found quilt"),
         ("view.png", "wiggle", r"view\.png: expected an animation file extension \(\.mp4, \.gif, \.webp"),
         ("view.gif", "quilt", r"view\.gif: expected a picture file extension \(\.png"),
-        ("view.mp4", None, r"view\.mp4: expected a picture file extension \(\.png"),
+        ("view.mp4", None, r"view\.mp4: expected an animation .* choose sweep or wiggle \(layout\)$"),
+        ("view.txt", None, r"view\.txt: expected a picture file extension \(\.png"),
     ],
 )
 def test_an_unknown_layout_or_one_that_does_not_fit_the_ending_is_refused(path, name, expected):
