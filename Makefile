@@ -1,4 +1,4 @@
-# make demo      depth, a new view and a report of the example, or of LEFT=… RIGHT=… (needs Python 3.11 or newer)
+# make demo      depth, a new view and a report of a sample pair, or of LEFT=… RIGHT=… (needs Python 3.11 or newer)
 # make test      run the tests, JOBS=3 files at a time
 # make coverage  run the tests, and report which lines of the package they do not run
 # make check     check style, types and imports between rooms, and run the tests
@@ -25,14 +25,11 @@ AUDIT = .venv-audit
 unexport PYTHONDONTWRITEBYTECODE
 
 EXAMPLE = examples/left.png examples/right.png
+PAIR = "$(LEFT)" $(if $(RIGHT),"$(RIGHT)")
 ifeq ($(LEFT),)
 ifneq ($(RIGHT),)
 $(error RIGHT needs LEFT beside it: make demo LEFT=left.png RIGHT=right.png)
 endif
-PAIR = $(EXAMPLE)
-CALIBRATION = --calib examples/calib.txt
-else
-PAIR = "$(LEFT)" $(if $(RIGHT),"$(RIGHT)")
 endif
 
 SBOM = $(AUDIT)/bin/cyclonedx-py environment --pyproject pyproject.toml --output-reproducible
@@ -46,9 +43,13 @@ PYTEST = $(DEV)/bin/pytest --numprocesses $(JOBS) --dist loadfile --no-loadscope
 .PHONY: demo test coverage check fuzz mutate bench audit release gallery
 
 demo: $(CORE)/installed
-	$(CORE)/bin/stereoweave depth $(PAIR) $(CALIBRATION) --out demo-out
+ifeq ($(LEFT),)
+	$(CORE)/bin/stereoweave demo --out demo-out
+else
+	$(CORE)/bin/stereoweave depth $(PAIR) --out demo-out
 	$(CORE)/bin/stereoweave view $(PAIR) --position 0.5 --out demo-out/view.png
 	@echo "Open the report in a browser: $(CURDIR)/demo-out/report.html"
+endif
 
 test: $(DEV)/installed
 	$(PYTEST)

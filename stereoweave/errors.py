@@ -149,6 +149,8 @@ def reason(error: Exception) -> str:
             return "a broken link"
         case FileExistsError():
             return "a file"
+        case UnicodeDecodeError():
+            return "one that is not UTF-8 text"
         case OSError(strerror=str(text)):
             return text.lower()
         case EOFError():

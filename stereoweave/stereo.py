@@ -51,11 +51,12 @@ class StereoCamera:
         for name, value in vars(self).items():
             check_number(name, value)
         # Smaller values underflow to 0 in float32 and give no depth.
-        if not (self.focal_px > 1 / CAMERA_NUMBERS_BELOW and self.baseline_m > 1 / CAMERA_NUMBERS_BELOW):
-            raise StereoweaveError(
-                f"focal_px and baseline_m must be above {1 / CAMERA_NUMBERS_BELOW:g}, "
-                f"got {self.focal_px} and {self.baseline_m}"
-            )
+        for name in ("focal_px", "baseline_m"):
+            value = getattr(self, name)
+            if not value > 1 / CAMERA_NUMBERS_BELOW:
+                raise StereoweaveError(
+                    f"expected a number above {1 / CAMERA_NUMBERS_BELOW:g}, found {value:g}", setting=name
+                )
         if not all(abs(value) < CAMERA_NUMBERS_BELOW for value in vars(self).values()):
             raise StereoweaveError(
                 f"camera parameters must be finite with magnitudes below {CAMERA_NUMBERS_BELOW:g}, got {self}"

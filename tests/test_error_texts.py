@@ -41,8 +41,9 @@ OTHERS = {
 }
 
 ERRORS = {
-    "left.png: expected a stereo picture, two views side by side or one above the other, found halves that "
-    "do not resemble each other; give two files, left and right; or choose one of "
+    "left.png: expected a stereo picture, two views side by side or one above the other, found what "
+    "looks like a single photograph (its halves do not resemble each other); give two files, left and right; "
+    "or choose one of "
     f"{LAYOUTS} (format)": lambda: open_pictures(PAIR[:1]),
     f"format: expected one of {LAYOUTS}, mpo, jps, found 'diagonal'": lambda: open_pictures(
         PAIR[:1], "diagonal"

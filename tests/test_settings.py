@@ -24,6 +24,7 @@ VARIABLE: dict[tuple[str, str], set[str]] = {
     ("errors.py", "error.setting"): set(),  # of an error that another one takes the place of
     ("pictures/pair_finding.py", "side"): {"left", "right"},
     ("rendering/renderer.py", "name"): {"up", "forward"},
+    ("stereo.py", "name"): {"focal_px", "baseline_m"},
     ("synth/sets/make.py", "name"): {"pairs", "seed", "frames"},
     ("video/job.py", "setting"): {"strength", "convergence_px"},
     ("video/job.py", "tuple(kinds)"): {"depth", "depth16", "position", "layout"},
@@ -33,11 +34,12 @@ SHARED = {"cameras", "matching", "outputs", "pictures", "rendering"}
 # Settings of these subpackages that the page and the service do not offer.
 ABSENT = {
     "page": {
-        *("convergence_px", "crop", "files", "forward", "layout", "left", "listed", "position", "provider"),
-        *("range_px", "raw", "refined", "right", "strength", "up"),
+        *("board", "convergence_px", "crop", "files", "forward", "layout", "left", "listed", "out"),
+        *("position", "provider", "range_px", "raw", "refined", "right", "strength", "up"),
     },
     "service": {
-        *("convergence_px", "crop", "files", "forward", "layout", "left", "listed", "provider", "raw"),
+        *("board", "convergence_px", "crop", "files", "forward", "layout", "left", "listed", "out"),
+        *("provider", "raw"),
         *("right", "up"),
     },
 }

@@ -56,7 +56,7 @@ def test_the_disparity_of_infinite_depth_is_minus_doffs():
     ],
 )
 def test_a_camera_refuses_nonsense(name, value):
-    with pytest.raises(StereoweaveError, match=re.escape(f"{value}")):
+    with pytest.raises(StereoweaveError, match=re.escape(f"{value:g}")):
         StereoCamera(**CAMERA | {name: value})
 
 

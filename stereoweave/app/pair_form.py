@@ -1,6 +1,5 @@
 """The page's form for a pair of pictures and its settings."""
 
-import importlib.resources
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
@@ -13,6 +12,7 @@ from stereoweave.app.session import Uploads
 from stereoweave.matching.backend import Backend
 from stereoweave.pictures.loading import FORMATS
 from stereoweave.pictures.prepare import Request
+from stereoweave.pictures.sample import sample_folder
 
 _DETECTED = "detected"
 MODELS = [("fast", "small"), ("fine", "base"), ("finest", "best")]
@@ -93,11 +93,6 @@ class PairForm:
         pictures = tuple(Path(file) for file in (given[self.left], given[self.right]) if file)
         backend = Backend(model=given[self.model], provider=provider)
         return Uploads(pictures=pictures, request=request, backend=backend)
-
-
-def sample_folder() -> Path:
-    """Return the folder that contains the sample pair."""
-    return Path(str(importlib.resources.files("stereoweave"))) / "sample"
 
 
 def make_layout_choice(label: str, names: Iterable[str], elem_id: str) -> gr.Dropdown:

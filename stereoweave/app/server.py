@@ -18,9 +18,9 @@ from starlette.middleware.trustedhost import TrustedHostMiddleware
 from stereoweave.app.access import ContentPolicy, OwnFiles
 from stereoweave.app.events import Host
 from stereoweave.app.page import make_page
-from stereoweave.app.pair_form import sample_folder
 from stereoweave.app.workers import Workers
 from stereoweave.matching.providers import CPU
+from stereoweave.pictures.sample import sample_folder
 
 _MOST_BYTES = 200 * 1024**2
 # Gradio applies our style sheet only inside this margin.

@@ -213,10 +213,10 @@ def measure_clicks(session: Session, clicks: Sequence[tuple[int, int]]) -> list[
 def format_summary(summary: Summary) -> str:
     """Format a result's size, time, disparity, depth and confidence as one line."""
     text = f"{summary.width_px}×{summary.height_px} px, matched in {summary.estimate_ms / 1000:.1f} s: "
-    text += f"disparity {summary.disparity_min_px:.1f} to {summary.disparity_max_px:.1f} px"
-    if summary.depth_min_m is not None:
+    text += f"disparity {summary.disparity_p1_px:.1f} to {summary.disparity_p99_px:.1f} px"
+    if summary.depth_p1_m is not None:
         middle = _format_metres(summary.depth_median_m)
-        text += f", depth from {summary.depth_min_m:.2f} m, median {middle}"
+        text += f", depth from {summary.depth_p1_m:.2f} m, median {middle}"
     return f"{text}; confident in {summary.confident_percent:.0f} % of the picture"
 
 

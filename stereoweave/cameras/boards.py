@@ -11,6 +11,9 @@ from stereoweave.cameras.rig import format_size
 from stereoweave.errors import FormatError, StereoweaveError
 
 _FEWEST_CORNERS = 8
+# A glance at a board: in a copy of at most this width, for boards of at least this many corners a side, since
+# parts of other patterns look like smaller ones.
+_GLANCE_WIDTH_PX, _GLANCE_CORNERS = 960, 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,6 +58,11 @@ class Board:
         if self.dictionary:
             return f"a ChArUco board of {self.columns}x{self.rows} squares ({self.dictionary})"
         return f"a chessboard of {self.columns}x{self.rows} inner corners"
+
+    @property
+    def sides(self) -> tuple[int, int]:
+        """Columns and rows, the more numerous first."""
+        return max(self.columns, self.rows), min(self.columns, self.rows)
 
     def charuco(self) -> cv2.aruco.CharucoBoard:
         """Return the ChArUco board as an OpenCV object."""
@@ -111,6 +119,23 @@ def find_pair_corners(
     if len(both) < _FEWEST_CORNERS or np.linalg.matrix_rank(places - places.mean(axis=0)) < 2:
         raise FormatError(f"only {len(both)} corners of the board are visible in both pictures")
     return PairCorners(name, both, here.at_px[in_left], there.at_px[in_right])
+
+
+def glance_at_chessboard(image: UInt8[np.ndarray, "h w"], board: Board) -> tuple[int, int] | None:
+    """Return the columns and rows of the chessboard that a picture seems to show, the more numerous first.
+
+    This takes about a twentieth of the time of `find_pair_corners` and may miss a board. None if no board is
+    found.
+    """
+    scale = min(1.0, _GLANCE_WIDTH_PX / image.shape[1])
+    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    # A smaller board than the printed one is found as a part of it, so the printed one is sought first.
+    for least in ((board.columns, board.rows), (_GLANCE_CORNERS, _GLANCE_CORNERS)):
+        flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
+        found, _, marks = cv2.findChessboardCornersSBWithMeta(small, least, flags)
+        if found:
+            return max(marks.shape), min(marks.shape)
+    return None
 
 
 def _find_chessboard(image: UInt8[np.ndarray, "h w"], board: Board) -> ViewCorners | None:

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from stereoweave.cameras.boards import Board, PairCorners, find_pair_corners
+from stereoweave.cameras.boards import Board, PairCorners, find_pair_corners, glance_at_chessboard
 from stereoweave.cameras.rig import Optics, Rig, Size, format_size
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io.decoding import ENDINGS
@@ -21,6 +21,8 @@ FEWEST_PAIRS = 5
 # A pair with an error of more than this many times the median has a misdetected corner or was taken in
 # motion.
 _OUTLIER = 3.0
+# Number of pairs that are looked at before the search, and of pictures that must show the same other board.
+_GLANCES, _AGREEING_GLANCES = 6, 3
 _GOOD_PX, _FAIR_PX = 0.5, 1.0
 _GOOD_COVER_PERCENT, _FAIR_COVER_PERCENT = 60, 40
 _GOOD_PAIRS, _GOOD_TILT_DEGREES = 10, 15
@@ -145,9 +147,12 @@ def calibrate(
         progress: Called with the name of each pair before its corners are detected.
 
     Raises:
-        StereoweaveError: The folder does not exist, or it contains fewer than FEWEST_PAIRS usable pairs.
+        StereoweaveError: The folder does not exist, it contains fewer than FEWEST_PAIRS usable pairs, or the
+            pictures show a chessboard with other numbers of corners.
     """
     pairs, left_out = find_pairs(Path(folder))
+    if not board.dictionary:
+        _check_count_of_corners(list(pairs.values()), board)
     seen, size_px = _find_all_corners(pairs, board, left_out, progress)
     _check_enough(len(seen), len(pairs), board, left_out)
     solve = _solve_fisheye if fisheye else _solve_pinhole
@@ -169,6 +174,33 @@ def calibrate(
             left_out[seen[index].name] = off
         seen = [pair for pair, is_far in zip(seen, far, strict=True) if not is_far]
         _check_enough(len(seen), len(pairs), board, left_out)
+
+
+def _check_count_of_corners(pairs: Sequence[tuple[Path, Path]], board: Board) -> None:
+    """Raise a StereoweaveError if a glance at some pictures shows a board with other numbers of corners.
+
+    A search for the wrong board in all pictures would take minutes, because it tries everything.
+    """
+    found: Counter[tuple[int, int] | None] = Counter()
+    chosen = np.unique(np.linspace(0, len(pairs) - 1, _GLANCES).round().astype(int))
+    for index in chosen:
+        for path in pairs[index]:
+            try:
+                image = cv2.cvtColor(read_image(path), cv2.COLOR_RGB2GRAY)
+            except FormatError:
+                continue
+            sides = glance_at_chessboard(image, board)
+            if sides == board.sides:
+                return
+            found[sides] += 1
+    found.pop(None, None)
+    sides, count = next(iter(found.most_common(1)), (None, 0))
+    if sides is not None and count >= _AGREEING_GLANCES and 2 * count > found.total():
+        raise StereoweaveError(
+            f"expected {board}, found one of {sides[0]}x{sides[1]} in {count} of {2 * len(chosen)} pictures; "
+            "count the inner corners, where four squares meet",
+            setting="board",
+        )
 
 
 def _check_enough(count: int, total: int, board: Board, left_out: Mapping[str, str]) -> None:

@@ -89,7 +89,11 @@ class Commands(typer.Typer):
 
     def __init__(self, help: str | None = None) -> None:
         super().__init__(
-            help=help, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None
+            help=help,
+            add_completion=False,
+            pretty_exceptions_enable=False,
+            rich_markup_mode=None,
+            context_settings={"help_option_names": ["--help", "-h"]},
         )
 
     def command(self, *given: Any, **options: Any) -> Callable[..., Any]:

@@ -1,7 +1,10 @@
 """The commands `stereoweave depth` and `stereoweave measure`."""
 
 import json
+import re
+from collections.abc import Sequence
 from dataclasses import asdict
+from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -30,12 +33,16 @@ from stereoweave.cli.options import (
 if TYPE_CHECKING:
     from stereoweave.outputs.report import Summary
 
+# Of what is farther, no rig measures the depth; a disparity slightly above 0 would give 367,134 m.
+_FARTHEST_M = 10_000
+
 Write = Annotated[
     list[str] | None,
     typer.Option(
         metavar="NAME",
-        help="Additional file to write: disparity.npy or disparity.tiff; in metres, if the camera is known, "
-        "depth.pfm, depth.npy, depth.tiff, cloud.ply, cloud.glb, mesh.ply or mesh.glb; or all. Repeatable.",
+        help="Additional file to write: disparity.npy, disparity.tiff or disparity_scaled.png; in metres, if "
+        "the camera is known, depth.pfm, depth.npy, depth.tiff, cloud.ply, cloud.glb, mesh.ply or mesh.glb; "
+        "or all. Repeatable.",
     ),
 ]
 PicturesOrFolder = Annotated[
@@ -63,13 +70,22 @@ Jobs = Annotated[
     int | None,
     typer.Option(min=1, help="Number of pairs processed in parallel (default: all cores)."),
 ]
+Out = Annotated[
+    Path | None,
+    typer.Option(
+        "--out",
+        "-o",
+        help="Folder to write the results to (default: in the current folder, named after the left picture, "
+        "the folder or the list, such as left_depth).",
+    ),
+]
 FocalError = Annotated[float, typer.Option(min=0, help="Uncertainty of the focal length, in percent.")]
 BaselineError = Annotated[float, typer.Option(min=0, help="Uncertainty of the baseline, in percent.")]
 
 
 def depth(  # noqa: PLR0913 - each is an option of the command line
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write the results to.")],
     pictures: PicturesOrFolder = None,
+    out: Out = None,
     left: Left = None,
     right: Right = None,
     listed: Listed = None,
@@ -103,13 +119,27 @@ def depth(  # noqa: PLR0913 - each is an option of the command line
         command=running_command(),
     )
     pictures = pictures or []
-    if found := find_pairs(pictures, left, right, listed):
+    found = find_pairs(pictures, left, right, listed)
+    out = out or _name_results(pictures, left, listed)
+    if found:
         from stereoweave.batch.local import run_batch_command
 
         raise typer.Exit(run_batch_command(found, out, job, processes=jobs, as_json=as_json))
     summary, notes = make_depth(pictures, out, job)
     lines = [note.format(job.name_of) for note in notes]
     (_print_json if as_json else _print_summary)(summary, lines, out)
+
+
+def _name_results(pictures: Sequence[Path], left: str | None, listed: Path | None) -> Path:
+    """Return the folder for the results if the user names none."""
+    if pictures or listed:
+        given = listed or pictures[0]
+        # The name of "." is that of the current folder.
+        name = given.absolute().resolve().name if given.is_dir() else given.stem
+    else:
+        fixed = takewhile(lambda part: not re.search(r"[*?\[]", part), Path(left or "").parent.parts)
+        name = Path(*fixed).name
+    return Path(f"{name}_depth" if name else "depth")
 
 
 def measure(  # noqa: PLR0913 - each is an option of the command line
@@ -161,11 +191,15 @@ def measure(  # noqa: PLR0913 - each is an option of the command line
         typer.echo("\n".join([str(found), *notes]))
 
 
-def _print_json(summary: "Summary", notes: list[str], out: Path) -> None:
+def _list_files(out: Path) -> dict[str, str]:
     from stereoweave.outputs.results import FILES
 
-    files = {file: str(out / file) for file in FILES if (out / file).exists()}
-    typer.echo(json.dumps(asdict(summary) | {"notes": notes, "files": files}, indent=2, allow_nan=False))
+    return {file: str(out / file) for file in FILES if (out / file).exists()}
+
+
+def _print_json(summary: "Summary", notes: list[str], out: Path) -> None:
+    found = asdict(summary) | {"notes": notes, "files": _list_files(out)}
+    typer.echo(json.dumps(found, indent=2, allow_nan=False))
 
 
 def _print_summary(summary: "Summary", notes: list[str], out: Path) -> None:
@@ -173,7 +207,21 @@ def _print_summary(summary: "Summary", notes: list[str], out: Path) -> None:
     typer.echo(
         f"{' + '.join(summary.pictures)}: {size}, matched by {summary.model} in {summary.estimate_ms:.0f} ms"
     )
-    typer.echo(f"disparity {summary.disparity_min_px:.1f} to {summary.disparity_max_px:.1f} px")
+    ranges = [f"disparity {summary.disparity_p1_px:.1f} to {summary.disparity_p99_px:.1f} px"]
+    if summary.camera and summary.depth_p1_m is None:
+        ranges.append("depth infinite")
+    elif summary.camera:
+        ranges.append(f"depth {_format_m(summary.depth_p1_m)} to {_format_m(summary.depth_p99_m)}")
+    typer.echo(f"{', '.join(ranges)} (98 % of the pixels)")
     for note in notes:
         typer.echo(note)
+    typer.echo(f"files: {', '.join(_list_files(out))}")
     typer.echo(f"report: {out / 'report.html'}")
+
+
+def _format_m(depth_m: float | None) -> str:
+    if depth_m is None:
+        return "infinity"
+    if depth_m > _FARTHEST_M:
+        return f"over {_FARTHEST_M / 1000:g} km"
+    return f"{depth_m:#.3g} m" if depth_m < 99.95 else f"{depth_m:.0f} m"

@@ -1,8 +1,10 @@
 """The command line `stereoweave`: its commands, exit codes and one-line errors."""
 
 import io
+import re
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -12,6 +14,7 @@ from stereoweave.cli.app import app as page
 from stereoweave.cli.batch import batch
 from stereoweave.cli.bench import bench
 from stereoweave.cli.commands import Commands
+from stereoweave.cli.demo import demo
 from stereoweave.cli.depth import depth, measure
 from stereoweave.cli.live import live
 from stereoweave.cli.rig import calibrate, check, rectify
@@ -21,6 +24,9 @@ from stereoweave.cli.train import export, train
 from stereoweave.cli.video import video
 from stereoweave.cli.view import view
 from stereoweave.errors import StereoweaveError
+
+# Of no use to someone who has typed a word in place of a number.
+_UNPARSED = re.compile(", unable to parse string as an? [a-z]+")
 
 app = Commands("Compute depth, and views from between or beyond the cameras, from a stereo pair.")
 app.add_typer(bench, name="bench")
@@ -39,11 +45,25 @@ def run(commands: Commands, program: str, arguments: Sequence[str] | None) -> in
     try:
         return commands(arguments, prog_name=program, standalone_mode=False) or 0
     except typer.TyperException as error:
-        message = error.format_message().rstrip(".") + f"; see {program} --help"
+        message = _describe_misuse(error, program, arguments)
     except (StereoweaveError, OSError) as error:
         message = str(error)
     typer.echo(f"{program}: " + " ".join(message.splitlines()), err=True)
     return 2
+
+
+def _describe_misuse(error: typer.TyperException, program: str, arguments: Sequence[str] | None) -> str:
+    """Return an error of the command line's own grammar, with the help to read."""
+    words, context = sys.argv[1:] if arguments is None else arguments, getattr(error, "ctx", None)
+    # The context's own name of the program is that of the file that runs.
+    names = [program]
+    while context is not None and context.parent is not None:
+        names.insert(1, str(context.info_name))
+        context = context.parent
+    message = _UNPARSED.sub("", error.format_message().rstrip(".")).replace("Input should be", "expected")
+    if len(names) == 1 and words and Path(words[0]).exists():
+        message = f"expected a command, such as depth or view, before the pictures, found {words[0]}"
+    return f"{message}; see {' '.join(names)} --help"
 
 
 def _show_version(wanted: bool) -> bool:
@@ -63,7 +83,7 @@ def _stereoweave(
     """Handle the options of the command `stereoweave` itself."""
 
 
-for command in (depth, measure, view, video, live, check, rectify, calibrate, serve, batch):
+for command in (demo, depth, measure, view, video, live, check, rectify, calibrate, serve, batch):
     app.command()(command)
 app.command("app")(page)
 app.command()(train)

@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -31,13 +32,14 @@ _MIDDLE = 0.5
 
 
 Out = Annotated[
-    Path,
+    Path | None,
     typer.Option(
         "--out",
         "-o",
-        help="File to write. Viewers recognise some layouts by a mark in the file name, which is added "
-        "automatically: view.png becomes view_qs8x6a0.75.png for a quilt. .mpo and .jps are 3-D pictures, "
-        ".html is a 3-D page (--layout viewer).",
+        help="File to write (default: in the current folder, named after the left picture and the layout, "
+        "such as left_view.png or left_wiggle.webp). Viewers recognise some layouts by a mark in the file "
+        "name, which is added automatically: view.png becomes view_qs8x6a0.75.png for a quilt. .mpo and .jps "
+        "are 3-D pictures, .html is a 3-D page (--layout viewer).",
     ),
 ]
 Position = Annotated[
@@ -96,7 +98,7 @@ Calib = Annotated[
 
 def view(  # noqa: PLR0913 - each is an option of the command line
     pictures: Pictures,
-    out: Out,
+    out: Out = None,
     position: Position = None,
     up: Up = 0.0,
     forward: Forward = 0.0,
@@ -127,6 +129,7 @@ def view(  # noqa: PLR0913 - each is an option of the command line
     from stereoweave.pictures.prepare import prepare
     from stereoweave.rendering.layouts import choose_layout
 
+    out = out or _name_view(pictures, layout)
     name = choose_layout(out, layout)
     _check_unused(name, {"--position": position, "--up": up or None, "--forward": forward or None}, quilt)
     if strength != 1 or convergence is not None:
@@ -153,6 +156,14 @@ def view(  # noqa: PLR0913 - each is an option of the command line
     typer.echo(f"{file.path}: {file.write(pair, estimate, prepared.pictures)}")
     for note in (*prepared.notes, *find_problems(pair, estimate, prepared.alignment)):
         typer.echo(note.format(running_options()))
+
+
+def _name_view(pictures: Sequence[Path], layout: str | None) -> Path:
+    """Return the file to write if the user names none."""
+    from stereoweave.rendering.layouts import ANIMATIONS, VIEWER
+
+    endings = dict.fromkeys(ANIMATIONS, ".webp") | {VIEWER: ".html"}
+    return Path(f"{pictures[0].stem}_{layout or 'view'}{endings.get(layout or '', '.png')}")
 
 
 def _check_unused(name: str | None, single_view: dict[str, float | None], quilt: str | None) -> None:

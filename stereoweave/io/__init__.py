@@ -10,6 +10,7 @@ from stereoweave.io.maps import (
     write_float_tiff,
     write_npy,
     write_pfm,
+    write_scaled_disparity_png,
 )
 
 __all__ = [
@@ -24,4 +25,5 @@ __all__ = [
     "write_image",
     "write_npy",
     "write_pfm",
+    "write_scaled_disparity_png",
 ]

@@ -19,6 +19,7 @@ from PIL import Image, UnidentifiedImageError, features
 
 from stereoweave.errors import FormatError, reason
 from stereoweave.io import exif
+from stereoweave.io.similar_names import describe_missing
 from stereoweave.stereo import LONGEST_SIDE_PX
 
 # 50 megapixels per view are supported; cameras of that class have up to 64. The limit is checked against the
@@ -32,6 +33,7 @@ ENDINGS = frozenset(
 # Not all of Pillow's formats: a PostScript file, for example, would run as a program. JPEG includes MPO and
 # JPS.
 _KINDS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "GIF", "PPM", "AVIF", "JPEG2000")
+_ANIMATIONS = ("GIF", "PNG", "WEBP", "AVIF")
 _RAW_ENDINGS = {
     *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dng", ".erf", ".iiq", ".kdc", ".mrw", ".nef", ".nrw", ".orf"),
     *(".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw", ".x3f"),
@@ -76,7 +78,7 @@ def open_picture(path: Path, *, views: int = 1, expected: str = A_PICTURE) -> It
         picture = _open(path, path, views)
     with picture:
         check_size(path, picture.size, views=views)
-        _refuse_by_content(path, picture)
+        _refuse_by_content(path, picture, views)
         yield picture
 
 
@@ -118,10 +120,16 @@ def check_regular(path: Path, expected: str) -> None:
     """Raise a FormatError unless the path is a regular file; pipes may block, and devices may be endless."""
     try:
         mode = path.stat().st_mode
+    except FileNotFoundError as error:
+        raise FormatError(f"{path}: expected {expected}, found {describe_missing(path)}") from error
     except (OSError, ValueError) as error:  # ValueError: a name with a zero byte
         raise FormatError(f"{path}: expected {expected}, found {reason(error)}") from error
     if not stat.S_ISREG(mode):
-        found = "a folder" if stat.S_ISDIR(mode) else "a pipe or a device; copy it into a file first"
+        found = (
+            "a folder; give the files in it"
+            if stat.S_ISDIR(mode)
+            else "a pipe or a device; copy it into a file first"
+        )
         raise FormatError(f"{path}: expected {expected}, found {found}")
 
 
@@ -154,9 +162,18 @@ def _decoding(path: str | Path, expected: str = A_PICTURE) -> Iterator[None]:
     except FormatError:
         raise
     except UnidentifiedImageError as error:
-        raise FormatError(f"{path}: expected {expected}, found another type of file") from error
+        raise FormatError(f"{path}: expected {expected}, found {_describe_other(path)}") from error
     except Exception as error:
         raise FormatError(f"{path}: expected {expected}, found {reason(error)}") from error
+
+
+def _describe_other(path: str | Path) -> str:
+    """Return what a file is that Pillow does not recognise as a picture."""
+    try:
+        is_empty = Path(path).stat().st_size == 0
+    except OSError:  # the content is part of another file
+        is_empty = False
+    return "an empty file; copy it again" if is_empty else "another type of file; save it as PNG or JPEG"
 
 
 def _open(path: str | Path, source: Path | io.BytesIO, views: int) -> Image.Image:
@@ -195,8 +212,8 @@ def _refuse_by_name(path: Path, head: bytes) -> None:
         raise FormatError(f"{path}: expected {A_PICTURE}, found a video; use 'stereoweave video'")
 
 
-def _refuse_by_content(path: Path, picture: Any) -> None:
-    """Raise a FormatError for a panorama, a VR180 picture or an animation."""
+def _refuse_by_content(path: Path, picture: Any, views: int) -> None:
+    """Raise a FormatError for a panorama, a VR180 picture or an animation of more frames than views."""
     description = picture.info.get("xmp", b"")
     words = description if isinstance(description, bytes) else str(description).encode(errors="replace")
     if b"GImage:" in words or b"equirectangular" in words.lower():
@@ -204,14 +221,21 @@ def _refuse_by_content(path: Path, picture: Any) -> None:
             f"{path}: expected an ordinary picture, found a VR180 picture or a 360-degree panorama "
             "(according to its XMP metadata); export two ordinary views from it"
         )
-    if picture.format in ("GIF", "PNG", "WEBP", "AVIF"):
-        with _decoding(path):
-            count = picture.n_frames
-        if count > 1:
-            raise FormatError(
-                f"{path}: expected one picture, found an animation of {count} frames; "
-                "save its two views as separate pictures"
-            )
+    count = _count_frames(path, picture)
+    if count > views:
+        wanted = "one picture" if views == 1 else "one picture, or an animation of two frames, left and right"
+        raise FormatError(
+            f"{path}: expected {wanted}, found an animation of {count} frames; "
+            "save its two views as separate pictures"
+        )
+
+
+def _count_frames(path: Path, picture: Any) -> int:
+    """Return the number of frames of an animation, or 1; other formats hold other pictures in more frames."""
+    if picture.format not in _ANIMATIONS:
+        return 1
+    with _decoding(path):
+        return int(picture.n_frames)
 
 
 def _to_eight_bits(path: Path, picture: Image.Image) -> Image.Image:
@@ -262,7 +286,12 @@ def _clean_text(text: str) -> str:
 
 
 def find_view_frames(path: Path, picture: Any) -> list[int]:
-    """Return the indices of the two frames that hold an MPO file's views; empty if there is only one view."""
+    """Return the indices of the two frames that hold an MPO file's views, or those of a two-frame animation.
+
+    The list is empty if there is only one view.
+    """
+    if picture.format in _ANIMATIONS:
+        return [0, 1] if _count_frames(path, picture) == 2 else []
     if picture.format != "MPO":
         return []
     with _decoding(path):
@@ -280,7 +309,7 @@ def find_view_frames(path: Path, picture: Any) -> list[int]:
 
 
 def read_frame(path: Path, picture: Image.Image, index: int) -> DecodedPicture:
-    """Decode a frame of an MPO file."""
+    """Decode a frame of an MPO file or an animation."""
     _seek(path, picture, index)
     check_size(path, picture.size)
     decoded = decode(path, picture)
@@ -289,7 +318,7 @@ def read_frame(path: Path, picture: Image.Image, index: int) -> DecodedPicture:
 
 
 def _seek(path: Path, picture: Image.Image, index: int) -> None:
-    """Seek to a frame of an MPO file and drop the tags and the profile of the previous frame."""
+    """Seek to a frame, and drop the tags and the profile of the previous one."""
     if picture.tell() == index:
         return
     for key in ("mp", "icc_profile"):
@@ -299,6 +328,6 @@ def _seek(path: Path, picture: Image.Image, index: int) -> None:
             picture.seek(index)
     except Exception as error:  # a damaged file may raise any exception, as in `_decoding`
         raise FormatError(
-            f"{path}: expected an undamaged MPO file, found that picture {index + 1} is truncated or damaged "
-            f"({_clean_text(str(error))})"
+            f"{path}: expected an undamaged {picture.format} file, found that picture {index + 1} is "
+            f"truncated or damaged ({_clean_text(str(error))})"
         ) from error

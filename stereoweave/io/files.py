@@ -34,7 +34,9 @@ def read_small(path: str | Path) -> bytes:
     with Path(path).open("rb") as file:
         content = file.read(MOST_SMALL_BYTES + 1)
     if len(content) > MOST_SMALL_BYTES:
-        raise FormatError(f"{path}: expected a file of at most {MOST_SMALL_BYTES} bytes, found more")
+        raise FormatError(
+            f"{path}: expected a text file of at most {MOST_SMALL_BYTES} bytes, found more; give another file"
+        )
     return content
 
 

@@ -1,12 +1,13 @@
 """Reading and writing pictures."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8, UInt16
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from stereoweave.arguments import check_kind
 from stereoweave.errors import FormatError, StereoweaveError
@@ -68,10 +69,11 @@ def make_pair(
     for path, image in ((left, left_image), (right, right_image)):
         check_large_enough(path, image)
     if left_image.shape != right_image.shape:
+        is_turned = left_image.shape[:2] == right_image.shape[1::-1]
+        remedy = "turn one of them upright" if is_turned else "crop or rescale one of them"
         raise FormatError(
             f"expected left and right pictures of the same size, found {left} with "
-            f"{_format_size(left_image)} and {right} with {_format_size(right_image)} pixels; "
-            "crop or rescale one of them"
+            f"{_format_size(left_image)} and {right} with {_format_size(right_image)} pixels; {remedy}"
         )
     return StereoPair(left=left_image, right=right_image)
 
@@ -92,12 +94,19 @@ def picture_kind(path: str | Path) -> str:
 
 
 def save_picture(
-    path: str | Path, values: UInt8[np.ndarray, "h w *channels"] | UInt16[np.ndarray, "h w"], kind: str
+    path: str | Path,
+    values: UInt8[np.ndarray, "h w *channels"] | UInt16[np.ndarray, "h w"],
+    kind: str,
+    *,
+    texts: Mapping[str, str] | None = None,
 ) -> None:
-    """Write values as a picture; `kind` is Pillow's name for the format."""
+    """Write values as a picture; `kind` is Pillow's name for the format, `texts` a PNG's text chunks."""
+    chunks = PngInfo()
+    for key, text in (texts or {}).items():
+        chunks.add_text(key, text)
     with replacing(path) as temporary, checking_format_size(path, values.shape):
         # Level 3 takes a third as long as Pillow's default, 6, and gives 5 % more bytes (at 741x500 px).
-        Image.fromarray(values).save(temporary, kind, quality=95, compress_level=3)
+        Image.fromarray(values).save(temporary, kind, quality=95, compress_level=3, pnginfo=chunks)
 
 
 @contextmanager

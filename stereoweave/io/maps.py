@@ -3,7 +3,9 @@
 import math
 import os
 import re
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float32, Shaped
@@ -17,6 +19,10 @@ from stereoweave.io.images import checking_format_size, save_picture
 # The number of digits is limited, because Python cannot print an integer of 4,301 digits.
 _PFM_HEADER = re.compile(rb"Pf\s+(\d{1,9})\s+(\d{1,9})\s+(\S{1,99})\s")
 _LONGEST_PFM_HEADER = 256
+# Disparity in px = 16-bit value * scale + offset; without these text chunks, value / 256.
+_SCALE, _OFFSET = "disparity_scale_px", "disparity_offset_px"
+_STEP_PX = 1 / 256
+_MOST_STEPS = 65535
 
 
 class RangeError(StereoweaveError):
@@ -101,13 +107,33 @@ def read_pixels(path: str | Path, *modes: str) -> Shaped[np.ndarray, "h w *chann
 
 
 def read_disparity_png(path: str | Path) -> Float32[np.ndarray, "h w"]:
-    """Read disparity in px from a 16-bit PNG of px * 256 (KITTI's format); 0 (unknown) becomes NaN."""
+    """Read disparity in px from a 16-bit PNG; 0 (unknown) becomes NaN.
+
+    The values are px * 256 (KITTI's format), unless text chunks give another scale and an offset, as in the
+    files of `write_scaled_disparity_png`.
+    """
     expected = "a 16-bit grey PNG of disparity * 256"
     with open_picture(Path(path), expected=expected) as picture:
         if not picture.mode.startswith("I"):
             raise FormatError(f"{path}: expected {expected}, found mode {picture.mode} ({picture.format})")
         steps = decode_values(path, picture)
-    return np.where(steps > 0, steps / 256, np.nan).astype(np.float32)
+        scale_px, offset_px = _read_scale(path, picture.info)
+    return np.where(steps > 0, steps * scale_px + offset_px, np.nan).astype(np.float32)
+
+
+def _read_scale(path: str | Path, texts: Mapping[Any, Any]) -> tuple[float, float]:
+    """Return the scale and the offset in px that a PNG's text chunks give."""
+    found = texts.get(_SCALE, _STEP_PX), texts.get(_OFFSET, 0)
+    try:
+        scale_px, offset_px = map(float, found)
+    except ValueError:
+        scale_px = offset_px = math.nan
+    if not (math.isfinite(scale_px) and math.isfinite(offset_px)):
+        raise FormatError(
+            f"{path}: expected numbers in the text chunks {_SCALE} and {_OFFSET}, "
+            f"found {found[0]!r:.30} and {found[1]!r:.30}"
+        )
+    return scale_px, offset_px
 
 
 def write_disparity_png(path: str | Path, disparity_px: Float[np.ndarray, "h w"]) -> None:
@@ -119,13 +145,50 @@ def write_disparity_png(path: str | Path, disparity_px: Float[np.ndarray, "h w"]
         RangeError: A known value is below 0 or above 255.99 px; nothing is written.
     """
     known = np.isfinite(disparity_px)
-    steps = np.rint(np.where(known, disparity_px, 0) * 256)
-    if steps.min() < 0 or steps.max() > 65535:
+    low_px, high_px = _find_range_px(disparity_px)
+    if find_scale(low_px, high_px):
         raise RangeError(
             f"{path}: not written; expected disparities of 0 to 255.99 px for a 16-bit PNG, "
-            f"found {disparity_px[known].min():.3f} to {disparity_px[known].max():.3f}; use a PFM file"
+            f"found {low_px:.3f} to {high_px:.3f}; use a PFM file"
         )
+    steps = np.rint(np.where(known, disparity_px, 0) / _STEP_PX)
     save_picture(path, np.where(known, np.maximum(steps, 1), 0).astype(np.uint16), "PNG")
+
+
+def find_scale(low_px: float, high_px: float) -> tuple[float, float] | None:
+    """Return the scale and the offset in px of a 16-bit PNG with disparities from `low_px` to `high_px`.
+
+    A value means value * scale + offset; no value is 0, which means unknown. The scale is a power of two and
+    the offset an integer, so that neither is rounded. None if px * 256 (KITTI's format) can hold the range.
+    """
+    if round(low_px / _STEP_PX) >= 0 and round(high_px / _STEP_PX) <= _MOST_STEPS:
+        return None
+    offset_px = math.floor(low_px) - 1.0
+    return max(_STEP_PX, 2.0 ** math.ceil(math.log2((high_px - offset_px) / _MOST_STEPS))), offset_px
+
+
+def format_scale(scale_px: float, offset_px: float) -> str:
+    """Return the formula that gives the disparity in px, such as "value / 256 - 45"."""
+    return f"value / {1 / scale_px:g} {'-' if offset_px < 0 else '+'} {abs(offset_px):g}"
+
+
+def write_scaled_disparity_png(path: str | Path, disparity_px: Float[np.ndarray, "h w"]) -> None:
+    """Write disparities of any range as a 16-bit PNG; NaN and infinity become 0 (unknown).
+
+    The disparity of a value is value * scale + offset. The text chunks disparity_scale_px and
+    disparity_offset_px contain both (`find_scale`; 1/256 and 0 if KITTI's format can hold the range).
+    """
+    known = np.isfinite(disparity_px)
+    scale_px, offset_px = find_scale(*_find_range_px(disparity_px)) or (_STEP_PX, 0.0)
+    steps = np.rint((np.where(known, disparity_px, 0).astype(np.float64) - offset_px) / scale_px)
+    steps = np.where(known, np.clip(steps, 1, _MOST_STEPS), 0).astype(np.uint16)
+    save_picture(path, steps, "PNG", texts={_SCALE: repr(scale_px), _OFFSET: repr(offset_px)})
+
+
+def _find_range_px(disparity_px: Float[np.ndarray, "h w"]) -> tuple[float, float]:
+    """Return the least and the greatest known disparity; both are 0 if none is known."""
+    known_px = disparity_px[np.isfinite(disparity_px)]
+    return (float(known_px.min()), float(known_px.max())) if known_px.size else (0.0, 0.0)
 
 
 def write_depth_png(path: str | Path, depth_m: Float[np.ndarray, "h w"]) -> None:

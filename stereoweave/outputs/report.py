@@ -19,6 +19,7 @@ from stereoweave.io.colormap import (
     find_colour_range_px,
     legend_colours,
 )
+from stereoweave.io.maps import find_scale, format_scale
 from stereoweave.io.text import writing_text
 from stereoweave.outputs.report_parts import (
     download_list,
@@ -53,6 +54,10 @@ class Summary:
     """Summary of a result; a depth is None if it is infinite or the camera is unknown.
 
     Attributes:
+        disparity_p1_px, disparity_p99_px: 1st and 99th percentile of the disparities.
+        depth_p1_m, depth_p99_m: Depths of the 99th and the 1st percentile of the disparities.
+        disparity_scale_px, disparity_offset_px: Scale and offset of disparity_scaled.png; None if the range
+            fits disparity.png.
         occluded_percent: Share of pixels that only the left camera sees.
         confident_percent: Share of pixels with a confidence of at least 0.5.
     """
@@ -63,10 +68,16 @@ class Summary:
     height_px: int
     estimate_ms: float
     disparity_min_px: float
+    disparity_p1_px: float
     disparity_median_px: float
+    disparity_p99_px: float
     disparity_max_px: float
+    disparity_scale_px: float | None
+    disparity_offset_px: float | None
     depth_min_m: float | None
+    depth_p1_m: float | None
     depth_median_m: float | None
+    depth_p99_m: float | None
     depth_max_m: float | None
     occluded_percent: float
     confident_percent: float
@@ -87,7 +98,10 @@ def summarize(
     """
     height_px, width_px = estimate.disparity_px.shape
     seen = _seen(pair)
-    low_px, median_px, high_px = np.percentile(estimate.disparity_px[seen], [0, 50, 100])
+    low_px, p1_px, median_px, p99_px, high_px = np.percentile(
+        estimate.disparity_px[seen], [0, 1, 50, 99, 100]
+    )
+    scale_px, offset_px = find_scale(float(low_px), float(high_px)) or (None, None)
     return Summary(
         pictures=pictures,
         model=model,
@@ -95,10 +109,16 @@ def summarize(
         height_px=height_px,
         estimate_ms=round(estimate_ms, 1),
         disparity_min_px=_round(low_px),
+        disparity_p1_px=_round(p1_px),
         disparity_median_px=_round(median_px),
+        disparity_p99_px=_round(p99_px),
         disparity_max_px=_round(high_px),
+        disparity_scale_px=scale_px,
+        disparity_offset_px=offset_px,
         depth_min_m=_depth_m(pair.camera, high_px),
+        depth_p1_m=_depth_m(pair.camera, p99_px),
         depth_median_m=_depth_m(pair.camera, median_px),
+        depth_p99_m=_depth_m(pair.camera, p1_px),
         depth_max_m=_depth_m(pair.camera, low_px),
         occluded_percent=_round(100 * estimate.occluded[seen].mean()),
         confident_percent=_round(100 * (estimate.confidence[seen] >= 0.5).mean()),
@@ -299,12 +319,21 @@ def _list_numbers(summary: Summary) -> list[tuple[str, str]]:
         ("Size", f"{summary.width_px} × {summary.height_px} px"),
         ("Model", summary.model),
         ("Time", _format_time(summary)),
-        ("Disparity", f"{summary.disparity_min_px:.1f} to {summary.disparity_max_px:.1f} px"),
+        (
+            "Disparity (98 % of the pixels)",
+            f"{summary.disparity_p1_px:.1f} to {summary.disparity_p99_px:.1f} px",
+        ),
         ("Median disparity", f"{summary.disparity_median_px:.1f} px"),
     ]
+    if summary.disparity_scale_px is not None and summary.disparity_offset_px is not None:
+        formula = format_scale(summary.disparity_scale_px, summary.disparity_offset_px)
+        rows.append(("In disparity_scaled.png", f"{formula} px"))
     if summary.camera:
         rows += [
-            ("Depth", f"{_format_metres(summary.depth_min_m)} to {_format_metres(summary.depth_max_m)}"),
+            (
+                "Depth (98 % of the pixels)",
+                f"{_format_metres(summary.depth_p1_m)} to {_format_metres(summary.depth_p99_m)}",
+            ),
             ("Median depth", _format_metres(summary.depth_median_m)),
             ("Focal length", f"{summary.camera.focal_px:.1f} px"),
             ("Baseline", f"{summary.camera.baseline_m * 1000:.1f} mm"),

@@ -23,11 +23,13 @@ from stereoweave.io.files import make_folder, make_parent_folder, reading
 from stereoweave.io.images import write_image
 from stereoweave.io.maps import (
     RangeError,
+    format_scale,
     write_depth_png,
     write_disparity_png,
     write_float_tiff,
     write_npy,
     write_pfm,
+    write_scaled_disparity_png,
 )
 from stereoweave.io.output_lock import lock_output
 from stereoweave.matching.backend import Backend
@@ -69,6 +71,7 @@ def _write_report(path: Path, result: Result) -> None:
 FILES: dict[str, Callable[[Path, Result], None]] = {
     "disparity.pfm": lambda path, result: write_pfm(path, result.disparity_px(np.inf)),
     "disparity.png": lambda path, result: write_disparity_png(path, result.disparity_px()),
+    "disparity_scaled.png": lambda path, result: write_scaled_disparity_png(path, result.disparity_px()),
     "disparity.npy": lambda path, result: write_npy(path, result.disparity_px()),
     "disparity.tiff": lambda path, result: write_float_tiff(path, result.disparity_px()),
     "depth.png": lambda path, result: write_depth_png(path, result.depth_m()),
@@ -86,6 +89,7 @@ FILES: dict[str, Callable[[Path, Result], None]] = {
 }
 ALWAYS = ("disparity.pfm", "disparity.png", "preview.png", "confidence.png", "occluded.png", "report.html")
 ALL = "all"
+SCALED = "disparity_scaled.png"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -213,14 +217,21 @@ def write_files(folder: Path, files: Sequence[str], result: Result) -> list[Note
             FILES[file](folder / file, result)
             notes += _note_thinning(file, result)
         except RangeError:
-            text = (
-                "no disparity.png: expected disparities of 0 to 255.99 px, found "
-                f"{result.summary.disparity_min_px:.2f} to {result.summary.disparity_max_px:.2f} px"
-            )
-            notes.append(Note(text, Remedy("use disparity.pfm")))
+            FILES[SCALED](folder / SCALED, result)
+            notes.append(_note_scaled(result.summary))
         except EmptyError as nothing:
             notes.append(Note(f"no {file}: {nothing}"))
     return notes
+
+
+def _note_scaled(summary: Summary) -> Note:
+    low_px, high_px = summary.disparity_min_px, summary.disparity_max_px
+    assert summary.disparity_scale_px is not None and summary.disparity_offset_px is not None
+    formula = format_scale(summary.disparity_scale_px, summary.disparity_offset_px)
+    return Note(
+        f"no disparity.png: expected disparities of 0 to 255.99 px, found {low_px:.2f} to {high_px:.2f} px",
+        Remedy(f"use disparity.pfm, or {SCALED}, in which px = {formula}"),
+    )
 
 
 def _note_thinning(file: str, result: Result) -> list[Note]:

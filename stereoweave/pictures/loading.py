@@ -1,4 +1,4 @@
-"""Opening of stereo pictures: two files, or one file with both views in any layout."""
+"""Opening of stereo pictures: two files, or one file with both views, in any layout or as an animation."""
 
 import re
 from collections.abc import Sequence
@@ -49,7 +49,8 @@ class Opened:
 
     Attributes:
         pair: Both views, upright and in sRGB.
-        layout: Layout of the files, which is a name in `PAIR_LAYOUTS`, "mpo" or "two_pictures".
+        layout: Layout of the files, which is a name in `PAIR_LAYOUTS`, "mpo" or "two_pictures" (also for an
+            animation of two frames).
         notes: Notes on what was detected or changed.
         lens: Camera parameters from EXIF, in pixels of the pair; None if EXIF has none.
     """
@@ -89,19 +90,28 @@ def open_pictures(paths: Sequence[Path], format: str | None = None) -> Opened:
             return _open_one(both, format)
     names = " ".join(map(str, paths))
     raise StereoweaveError(
-        f"expected two pictures, left and right, or one that holds both views, found {len(paths)}: {names}"
+        f"expected two pictures, left and right, or one that holds both views, found {len(paths)}: {names}",
+        remedy=Remedy("if one of them is the output, name it as such", ("out",)) if paths else None,
     )
 
 
 def pixel_factor(path: Path, picture: Image.Image, format: str | None) -> int:
     """Return the ratio, 1 or 2, of the number of pixels in both views to the number in the file's header.
 
-    It is 2 for MPO files, and for half-size views declared by `format` or by the file's JPS header.
+    It is 2 for MPO files and animations of two frames, and for half-size views declared by `format` or by the
+    file's JPS header.
     """
-    if format in (None, "mpo") and find_view_frames(path, picture):
+    if _find_frames(path, picture, format):
         return 2
     known = PAIR_LAYOUTS.get(_read_declared(path, picture, format)[0] or "")
     return 2 if known is not None and known.half else 1
+
+
+def _find_frames(path: Path, picture: Image.Image, format: str | None) -> list[int]:
+    """Return the frames that hold the two views; empty if one frame holds both, as far as `format` tells."""
+    if picture.format == "MPO" and format not in (None, "mpo"):
+        return []
+    return find_view_frames(path, picture)
 
 
 def _open_two(left: Path, right: Path) -> Opened:
@@ -118,9 +128,11 @@ def _open_two(left: Path, right: Path) -> Opened:
 
 def _open_one(path: Path, format: str | None) -> Opened:
     with open_picture(path, views=2) as picture:
-        frames = find_view_frames(path, picture) if format in (None, "mpo") else []
-        if frames:
+        frames = _find_frames(path, picture, format)
+        if frames and picture.format == "MPO":
             return _open_mpo(path, picture, frames)
+        if frames:
+            return _open_animation(path, picture, frames, format)
         if format == "mpo":
             raise FormatError(
                 f"{path}: expected an MPO file with two pictures of the same size, found only one"
@@ -131,13 +143,14 @@ def _open_one(path: Path, format: str | None) -> Opened:
     image = decoded.upright(lies)
     if name is None:
         name, why = _detect_picture_layout(path, image), "detected from name and content"
-    left, right = _split_views(path, image, PAIR_LAYOUTS[name])
-    height_px, width_px = left.shape[:2]
     notes = [Note(f"{name}, {why}", _OVERRIDE)] if why else []
+    layout = PAIR_LAYOUTS[name]
+    left, right = _split_views(path, layout.trim(image), layout)
+    height_px, width_px = left.shape[:2]
     return Opened(
         pair=StereoPair(left=left, right=right),
         layout=name,
-        notes=(*notes, *_note_turns(lies), *_note_colours([decoded])),
+        notes=(*notes, *_note_trimming(image, layout), *_note_turns(lies), *_note_colours([decoded])),
         lens=exif.read_lens(decoded.tags, width_px, height_px),
     )
 
@@ -162,6 +175,28 @@ def _open_mpo(path: Path, picture: Image.Image, frames: Sequence[int]) -> Opened
             *_note_colours(decoded),
         ),
         lens=_read_lens(decoded),
+    )
+
+
+def _open_animation(path: Path, picture: Image.Image, frames: Sequence[int], format: str | None) -> Opened:
+    """Open the pair in an animation of two frames; the left view is taken to be the first one."""
+    if format is not None:
+        raise FormatError(
+            f"{path}: expected one picture, found an animation of two frames, which are the left and the "
+            "right view",
+            remedy=Remedy("omit the layout", ("format",)),
+        )
+    left, right = (read_frame(path, picture, index) for index in frames)
+    lies = exif.read_orientation(left.tags)
+    return Opened(
+        pair=make_pair(path, left.upright(lies), path, right.upright(lies)),
+        layout=TWO_PICTURES,
+        notes=(
+            Note("an animation of two frames, taken for the left and the right view"),
+            *_note_turns(lies),
+            *_note_colours([left, right]),
+        ),
+        lens=_read_lens([left, right]),
     )
 
 
@@ -253,6 +288,14 @@ def _read_lens(decoded: Sequence[DecodedPicture]) -> exif.Lens | None:
     """Read camera parameters from the tags of both pictures; the first picture's tags take precedence."""
     first, second = decoded
     return exif.read_lens({**second.tags, **first.tags}, *first.image.size)
+
+
+def _note_trimming(image: UInt8[np.ndarray, "h w 3"], layout: PairLayout) -> list[Note]:
+    line, size = ("column", "width") if layout.beside else ("row", "height")
+    size_px = image.shape[1 if layout.beside else 0]
+    if size_px % 2 == 0:
+        return []
+    return [Note(f"the last {line} is dropped, because the {size}, {size_px} px, is odd")]
 
 
 def _note_turns(lies: int | None) -> list[Note]:

@@ -105,12 +105,22 @@ def find_pairs(
     """
     ways = {"pictures": pictures, "patterns": left or right, "a list": listed}
     given = [way for way, value in ways.items() if value]
-    if len(given) != 1 or (left is None) != (right is None):
-        found = " and ".join(given) if len(given) != 1 else "only one of the two patterns"
+    if len(given) != 1:
         raise StereoweaveError(
             "expected pictures or a folder, patterns of left and right pictures, or a list of pairs, "
-            f"found {found or 'none'}",
+            f"found {' and '.join(given) or 'none'}",
             remedy=Remedy("give exactly one of them", ("left", "right", "listed")),
+        )
+    if (left is None) != (right is None):
+        missing = "left" if left is None else "right"
+        raise StereoweaveError(
+            f"expected patterns of the left and of the right pictures, found none of the {missing} ones",
+            remedy=Remedy("give both, or give the pictures themselves", ("left", "right")),
+        )
+    if len(pictures) == 2 and all(path.is_dir() for path in pictures):
+        raise StereoweaveError(
+            f"expected two pictures, or one folder of pairs, found two folders: {pictures[0]} {pictures[1]}",
+            remedy=Remedy("give a pattern of the pictures in each, such as 'left/*.png'", ("left", "right")),
         )
     if listed:
         return FoundPairs(read_pair_list(listed))
@@ -140,7 +150,7 @@ def find_pairs_in(folder: Path) -> FoundPairs:
         )
         for pair in listed.pairs
     ]
-    return FoundPairs(pairs, note_left_out(folder, listed.left_out))
+    return FoundPairs(pairs, (*_note_unmarked(folder, pairs), *note_left_out(folder, listed.left_out)))
 
 
 def find_pairs_among(folder: str | Path, paths: Iterable[str]) -> Listed:
@@ -174,6 +184,17 @@ def find_pairs_among(folder: str | Path, paths: Iterable[str]) -> Listed:
     films = [ListedPair(_sanitize(path), (path,)) for path in sorted(files["film"])]
     _check_names((pair.name, pair.files[0]) for pair in chain(pairs, films))
     return Listed(pairs, films, rest)
+
+
+def _note_unmarked(folder: Path, pairs: Sequence[NamedPair]) -> tuple[str, ...]:
+    """Return a note if every picture is taken to hold both views, because none has a side in its name."""
+    suffixes = {picture.suffix.lower() for pair in pairs for picture in pair.pictures}
+    if any(len(pair.pictures) == 2 for pair in pairs) or suffixes & {*_ENDINGS["both views"]}:
+        return ()
+    return (
+        f"{folder}: no two names differ in left and right alone, as 1_L.jpg and 1_R.jpg do, so each picture "
+        "is taken to hold both views",
+    )
 
 
 def note_left_out(folder: str | Path, pictures: Sequence[str]) -> tuple[str, ...]:

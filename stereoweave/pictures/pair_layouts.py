@@ -11,6 +11,7 @@ from jaxtyping import Float32, UInt8
 
 from stereoweave.errors import FormatError, Remedy
 from stereoweave.io.images import SMALLEST_SIDE_PX
+from stereoweave.pictures.anaglyphs import looks_like_anaglyph
 
 Picture = UInt8[np.ndarray, "h w 3"]
 Frame = UInt8[np.ndarray, "rows columns 3"]
@@ -38,6 +39,11 @@ class PairLayout(NamedTuple):
         if self.half:
             return width_px, height_px
         return (width_px // 2, height_px) if self.beside else (width_px, height_px // 2)
+
+    def trim(self, frame: Frame) -> Picture:
+        """Return a frame whose width (or height) is even: without its last column (or row) if it is odd."""
+        height_px, width_px = frame.shape[:2]
+        return frame[:, : width_px // 2 * 2] if self.beside else frame[: height_px // 2 * 2]
 
     def eyes(self, frame: Frame) -> tuple[Picture, Picture]:
         """Return the left and the right view of a frame, each at full size."""
@@ -76,12 +82,15 @@ _NARROWEST_EYE, _WIDEST_EYE = 1.2, 2.5
 # Photographs are upright, square or wide. If the aspect ratio fits both full and half size, the ratio of
 # horizontal to vertical contrast between neighbouring pixels decides. Its median over painted pictures is
 # 0.96 for full views, 1.58 for half width and 0.57 for half height.
-_UPRIGHT_EYE, _LOW_EYE, _LOWEST_EYE, _SQUEEZED_CONTRAST = 0.5, 2.0, 3.0, 1.25
+_UPRIGHT_EYE, _LOW_EYE, _LOWEST_EYE, _SQUEEZED_CONTRAST = 0.525, 2.0, 3.0, 1.25
+# Nearly square pictures more often hold half-width views than views as tall as these, unless they are 9:16.
+_TALL_EYE, _SQUEEZED_CONTRAST_OF_TALL, _PHONE = 0.6, 1.0, 9 / 16
 _SCREEN, _SCREEN_TOLERANCE = 16 / 9, 0.01
 _DETAIL_PX = 480
 # Limits of a whole frame's aspect ratio. Two upright phone pictures side by side have at least the first; two
-# half-height views of the widest film, one above the other, have at most the second.
-_NARROWEST_BESIDE, _WIDEST_ABOVE = 1.05, 2.45
+# half-height views of the widest film, one above the other, have at most the last. A photograph between the
+# first two holds half-width views of an upright or square photograph.
+_NARROWEST_BESIDE, _NARROWEST_HALVES, _WIDEST_ABOVE = 1.05, 0.74, 2.45
 
 # The resemblance is 0.34 or more for 95 % of painted or rendered pairs, many of which have far larger
 # disparities than 3-D videos. It is at most 0.13 for the two halves of a single picture, and at most 0.23 if
@@ -190,22 +199,27 @@ def _confirm(named: str | None, frames: Sequence[Frame]) -> str | None:
 def _detect_by_content(name: str, frames: Sequence[Frame], photograph: bool) -> str:
     height_px, width_px = frames[0].shape[:2]
     plausible = {
-        "side_by_side": width_px >= _NARROWEST_BESIDE * height_px,
+        "side_by_side": width_px >= (_NARROWEST_HALVES if photograph else _NARROWEST_BESIDE) * height_px,
         "top_bottom": width_px <= _WIDEST_ABOVE * height_px,
     }
     alike = {kind: _score_halves(kind, frames) for kind, may_be in plausible.items() if may_be}
     best = max(alike, key=lambda kind: np.nan_to_num(alike[kind], nan=-1))
     if alike[best] >= _ALIKE:
         return best
-    found = (
-        "a picture that is too plain to tell"
-        if np.isnan(alike[best])
-        else "halves that do not resemble each other"
-    )
+    if np.isnan(alike[best]):
+        found = "a picture that is too plain to tell; give two files, left and right"
+    elif not photograph:
+        found = "halves that do not resemble each other; give two files, left and right"
+    elif looks_like_anaglyph(frames[0]):
+        found = "an anaglyph, which mixes both views into one picture; give the two pictures it was made from"
+    else:
+        found = (
+            "what looks like a single photograph (its halves do not resemble each other); give two files, "
+            "left and right"
+        )
     expected = "a stereo picture" if photograph else "a 3-D video"
     raise FormatError(
-        f"{name}: expected {expected}, two views side by side or one above the other, found {found}; "
-        "give two files, left and right",
+        f"{name}: expected {expected}, two views side by side or one above the other, found {found}",
         remedy=Remedy(f"or choose one of {', '.join(PAIR_LAYOUTS)}", ("format",)),
     )
 
@@ -225,7 +239,9 @@ def _looks_squeezed_photograph(kind: str, frame: Frame) -> bool:
         if abs(width_px / height_px / _SCREEN - 1) < _SCREEN_TOLERANCE:
             return True
         if _UPRIGHT_EYE <= aspect < _NARROWEST_EYE:
-            return _measure_contrast_ratio(kind, frame) > _SQUEEZED_CONTRAST
+            is_tall = aspect < _TALL_EYE and abs(aspect / _PHONE - 1) > _SCREEN_TOLERANCE
+            least = _SQUEEZED_CONTRAST_OF_TALL if is_tall else _SQUEEZED_CONTRAST
+            return _measure_contrast_ratio(kind, frame) > least
         return aspect < _UPRIGHT_EYE
     aspect = 2 * width_px / height_px
     if _LOW_EYE < aspect < _LOWEST_EYE:

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from stereoweave.errors import StereoweaveError
+from stereoweave.errors import Remedy, StereoweaveError
 from stereoweave.io.animation import check_animation_ending
 from stereoweave.io.colormap import find_colour_range_px
 from stereoweave.io.files import replacing
@@ -29,6 +29,8 @@ _FAN = (-0.5, 1.5)
 # Side of the largest quilt that Looking Glass recommends (for its 32-inch and 65-inch displays).
 _QUILT_SIDE_PX = 8192
 _MOST_VIEWS = 200
+# .webp is a picture or an animation.
+_MOVING_ENDINGS = (".mp4", ".gif")
 _SHEET_SIDE = 3
 
 # Luma of Rec. 601, as in JPEG and OpenCV.
@@ -263,6 +265,11 @@ def choose_layout(path: str | Path, name: str | None) -> str | None:
     if name == VIEWER:
         raise StereoweaveError(
             f"{path}: expected the file extension .html for the layout viewer, found {Path(path).suffix!r}"
+        )
+    if name is None and ending in _MOVING_ENDINGS:
+        raise StereoweaveError(
+            f"{path}: expected an animation for this extension, found a single view",
+            remedy=Remedy(f"choose {' or '.join(ANIMATIONS)}", ("layout",)),
         )
     if name in ANIMATIONS:
         check_animation_ending(path)

@@ -16,8 +16,9 @@ PAIR = {"left": "left.png", "right": "right.png"}
 Say = Callable[..., list[str]]
 
 ERRORS: dict[str, tuple[dict[str, str], dict[str, Any]]] = {
-    "left.png: expected a stereo picture, two views side by side or one above the other, found halves that "
-    "do not resemble each other; give two files, left and right; or choose one of "
+    "left.png: expected a stereo picture, two views side by side or one above the other, found what "
+    "looks like a single photograph (its halves do not resemble each other); give two files, left and right; "
+    "or choose one of "
     f"{LAYOUTS} (“Layout of a single file”)": ({"left": "left.png"}, {}),
     "“Layout of a single file”: expected one picture that holds both views, found two, left.png and "
     "right.png; omit this setting, and give the left picture first": (PAIR, {"layout": "crossed"}),

@@ -60,15 +60,22 @@ def charucos(tmp_path_factory):
     return folder
 
 
+@pytest.fixture(scope="module")
+def chessboards(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("chessboard")
+    take_pictures(folder, rig_of(pinhole), CHESSBOARD)
+    return folder
+
+
 @pytest.fixture(
     scope="module",
     params=[(pinhole, CHESSBOARD), (pinhole, CHARUCO), (fisheye, CHESSBOARD), (fisheye, CHARUCO)],
 )
-def taken(request, tmp_path_factory, charucos):
+def taken(request, tmp_path_factory, chessboards, charucos):
     """Return a folder of pictures, the board that they show, and the true rig that took them."""
     lens, board = request.param
-    if (lens, board) == (pinhole, CHARUCO):
-        return charucos, board, rig_of(lens)
+    if lens == pinhole:
+        return charucos if board == CHARUCO else chessboards, board, rig_of(lens)
     folder = tmp_path_factory.mktemp("boards")
     take_pictures(folder, rig_of(lens), board)
     return folder, board, rig_of(lens)
@@ -172,6 +179,25 @@ def test_another_board_than_the_one_named_is_refused(charucos):
     ) as caught:
         calibrate(charucos, other)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("given", ["8x6", "10x7", "5x4"])
+def test_a_chessboard_with_other_numbers_of_corners_is_named(chessboards, tmp_path, capsys, given):
+    out = tmp_path / "rig.yml"
+    assert main(["calibrate", str(chessboards), "--board", given, "--square-mm", "25", "-o", str(out)]) == 2
+    assert capsys.readouterr().err == (
+        f"stereoweave: --board: expected a chessboard of {given} inner corners, found one of 9x6 in 12 of 12 "
+        "pictures; count the inner corners, where four squares meet\n"
+    )
+    assert not out.exists()
+
+
+def test_pictures_without_a_board_are_refused_after_the_whole_search(tmp_path):
+    for number in range(5):
+        for side in ("left", "right"):
+            write_image(tmp_path / f"{side}{number}.png", np.full((64, 96, 3), 90, np.uint8))
+    with pytest.raises(StereoweaveError, match="found it in 0 of 5"):
+        calibrate(tmp_path, CHESSBOARD)
 
 
 def test_too_few_pairs_are_refused(copied):

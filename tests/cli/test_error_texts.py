@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 from error_examples import LAYOUTS, write_error_examples
+from PIL import Image
 
 from stereoweave.cli.root import main
 from stereoweave.outputs.results import FILES
@@ -15,10 +16,11 @@ NO_CAMERA = (
     "expected a camera for depth, found none; give a calibration, or the focal length and baseline of a "
     "rectified pair (--calib, --focal-px, --baseline-m)"
 )
+PICTURE = "a picture (PNG, JPEG, TIFF or the like)"
 ERRORS = {
     "depth left.png -o out": "left.png: expected a stereo picture, two views side by side or one above the "
-    "other, found halves that do not resemble each other; give two files, left and right; or choose one of "
-    f"{LAYOUTS} (--format)",
+    "other, found what looks like a single photograph (its halves do not resemble each other); give two "
+    f"files, left and right; or choose one of {LAYOUTS} (--format)",
     f"depth {PAIR} --format crossed -o out": "--format: expected one picture that holds both views, found "
     "two, left.png and right.png; omit this setting, and give the left picture first",
     "view both.png --format diagonal -o out.png": f"--format: expected one of {LAYOUTS}, mpo, jps, found "
@@ -52,6 +54,40 @@ ERRORS = {
     "--list)",
     "depth --left none*.png --right right*.png -o out": "--left: expected pictures that match none*.png, "
     "found none; check and quote the pattern",
+    "depth lef.png right.png": f"lef.png: expected {PICTURE}, found no such file; did you mean left.png?",
+    "depth left.png Right.png": f"Right.png: expected {PICTURE}, found no such file; did you mean right.png?",
+    "depth *.jpg": f"*.jpg: expected {PICTURE}, found no file that matches",
+    "depth http://a.org/left.png right.png": f"http:/a.org/left.png: expected {PICTURE}, found an address; "
+    "download the file first, because nothing is fetched",
+    "depth left.png notes.txt": f"notes.txt: expected {PICTURE}, found another type of file; save it as PNG "
+    "or JPEG",
+    "depth left.png empty.png": f"empty.png: expected {PICTURE}, found an empty file; copy it again",
+    f"depth {PAIR} out": "expected two pictures, left and right, or one that holds both views, found 3: "
+    "left.png right.png out; if one of them is the output, name it as such (--out)",
+    f"view {PAIR} out.png": "expected two pictures, left and right, or one that holds both views, found 3: "
+    "left.png right.png out.png; if one of them is the output, name it as such (--out)",
+    "check folder": f"folder: expected {PICTURE}, found a folder; give the files in it",
+    "depth folder folder": "expected two pictures, or one folder of pairs, found two folders: folder folder; "
+    "give a pattern of the pictures in each, such as 'left/*.png' (--left, --right)",
+    "depth left.png turned.png": "expected left and right pictures of the same size, found left.png with "
+    "640x480 and turned.png with 480x640 pixels; turn one of them upright",
+    "depth --left left.png": "expected patterns of the left and of the right pictures, found none of the "
+    "right ones; give both, or give the pictures themselves (--left, --right)",
+    "depth --list left.png": "left.png: expected a list of pairs, found one that is not UTF-8 text",
+    f"depth {PAIR} --calib left.png": "left.png: expected a text file of at most 262144 bytes, found more; "
+    "give another file",
+    f"depth {PAIR} --focal-px 500 --baseline-m 0": "--baseline-m: expected a number above 1e-09, found 0",
+    f"depth {PAIR} --focal-px -500 --baseline-m 1": "--focal-px: expected a number above 1e-09, found -500",
+    f"depth {PAIR} --focal-px 5mm": "Invalid value for '--focal-px': expected a valid number; see "
+    "stereoweave depth --help",
+    f"depth {PAIR} --threads many": "Invalid value for '--threads': expected a valid integer; see "
+    "stereoweave depth --help",
+    f"view {PAIR} -o out.gif": "out.gif: expected an animation for this extension, found a single view; "
+    "choose sweep or wiggle (--layout)",
+    f"{PAIR}": "expected a command, such as depth or view, before the pictures, found left.png; see "
+    "stereoweave --help",
+    "bench pair scenes": "No such command 'pair'. Did you mean 'pairs', 'parity'?; see stereoweave "
+    "bench --help",
     "batch . out --gpus-each 1.5": (
         "--gpus-each: expected 0, a fraction below 1, or a whole number, found 1.5"
     ),
@@ -90,6 +126,11 @@ NOTES = {
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch) -> Path:
     write_error_examples(tmp_path)
+    (tmp_path / "notes.txt").write_text("words")
+    (tmp_path / "empty.png").touch()
+    (tmp_path / "folder").mkdir()
+    with Image.open(tmp_path / "right.png") as picture:
+        picture.transpose(Image.Transpose.ROTATE_90).save(tmp_path / "turned.png")
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -120,6 +161,21 @@ def test_notes_on_a_video_do_not_advise_rectification(capsys):
     assert main(["video", "upper.png", "lower.png", "--depth", "-o", "out.mkv", "--threads", "1"]) == 0
     (line,) = [line for line in capsys.readouterr().err.splitlines() if "px lower" in line]
     assert line == "0:00:00.000 the right picture is 2.0 px lower than the left one"
+
+
+def test_a_folder_whose_pictures_name_no_side_says_what_they_are_taken_for(capsys):
+    for name in ("left.png", "right.png"):
+        Path(name).rename(Path("folder") / {"left.png": "a.png", "right.png": "b.png"}[name])
+    assert main(["depth", "folder", "--jobs", "1"]) == 1
+    told = capsys.readouterr().err
+    assert "folder: no two names differ in left and right alone, as 1_L.jpg and 1_R.jpg do, so each" in told
+    assert "a: folder/a.png: expected a stereo picture" in told
+
+
+def test_the_short_option_for_help_is_that_of_other_programs(capsys):
+    for words in (["-h"], ["depth", "-h"], ["bench", "pairs", "-h"]):
+        assert main(words) == 0
+        assert "Usage: stereoweave " + " ".join(words[:-1]) in capsys.readouterr().out
 
 
 def test_a_folder_with_two_pairs_of_one_name_advises_a_list(capsys):

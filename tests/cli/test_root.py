@@ -15,7 +15,7 @@ from stereoweave.bench.opencv_matchers import OPENCV_MATCHERS
 from stereoweave.cli.options import find_allowed_hosts, listen
 from stereoweave.cli.root import main
 from stereoweave.io.images import read_image
-from stereoweave.io.maps import read_pfm
+from stereoweave.io.maps import read_disparity_png, read_pfm
 from stereoweave.matching.matcher import shipped_models
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -91,7 +91,6 @@ def mistakes(pictures) -> Path:
     left.save("left.jpg")
     left.crop((0, 0, 80, 64)).save("narrow.png")
     left.crop((0, 0, 31, 64)).save("tiny.png")
-    left.crop((0, 0, 95, 64)).save("odd.png")
     truncate(Path("left.png"), Path("half.png"))
     truncate(Path("left.jpg"), Path("half.jpg"))
     truncate(Path("calib.txt"), Path("half.txt"))
@@ -131,7 +130,7 @@ def mistakes(pictures) -> Path:
             ["left.png with 96x64", "narrow.png with 80x64 pixels", "the same size"],
         ),
         ("depth tiny.png tiny.png -o out", ["tiny.png", "at least 32x32", "found 31x64"]),
-        ("depth odd.png --format side_by_side -o out", ["odd.png", "an even width", "found 95x64"]),
+        ("depth tiny.png --format side_by_side -o out", ["tiny.png", "an even width", "found 30x64"]),
         ("depth left.png right.png both.png -o out", ["two pictures, left and right", "found 3", "both.png"]),
         ("view left.png right.png both.png left.png -o out.png", ["two pictures, left and right", "found 4"]),
         (
@@ -187,7 +186,6 @@ def mistakes(pictures) -> Path:
         ("view left.png right.png -o taken.png", ["taken.png", "expected a writable file", "found a folder"]),
         ("bench pairs scenes --model sgbm.onnx -o rows.csv", ["sgbm.onnx", "rename"]),
         ("depth left.png right.png --threads 0 -o out", ["--threads"]),
-        ("depth left.png right.png", ["--out"]),
         ("bench pairs folder -o out.csv", ["folder", "left.png"]),
         ("train none.toml -o out", ["none.toml"]),
         ("export folder -o out.onnx", ["folder"]),
@@ -271,6 +269,57 @@ def test_depth_png_is_in_millimetres(pictures):
     assert np.median(np.asarray(Image.open("out/depth.png"))) == 1000
 
 
+@pytest.mark.parametrize(
+    ("arguments", "out"),
+    [
+        ("left.png right.png", "left_depth"),
+        ("both.png --format side_by_side", "both_depth"),
+        ("scenes", "scenes_depth/wall"),
+        ("--left scenes/*/left.png --right scenes/*/right.png", "scenes_depth/wall"),
+        ("--left left*.png --right right*.png", "depth/{here}"),
+        ("--list my.pairs.txt", "my.pairs_depth/{here}"),
+    ],
+)
+def test_without_out_the_results_are_named_after_what_was_given(mistakes, arguments, out):
+    Path("my.pairs.txt").write_text("left.png right.png\n")
+    save_matcher(Path("eight.onnx"), 8.0)
+    assert run(f"depth {arguments} --model eight.onnx --jobs 1") == 0
+    assert (mistakes / out.format(here=mistakes.name) / "disparity.pfm").is_file()
+
+
+def test_without_out_the_results_of_the_current_folder_are_named_after_it(mistakes, monkeypatch):
+    save_matcher(Path("eight.onnx"), 8.0)
+    monkeypatch.chdir("scenes")
+    assert run("depth . --model ../eight.onnx --jobs 1") == 0
+    assert Path("scenes_depth/wall/disparity.pfm").is_file()
+
+
+@pytest.mark.parametrize(
+    ("options", "name"),
+    [
+        ("", "left_view.png"),
+        ("--layout crossed", "left_crossed_RLF_cross.png"),
+        ("--layout wiggle", "left_wiggle.webp"),
+    ],
+)
+def test_without_out_a_view_is_named_after_the_left_picture(pictures, options, name):
+    save_matcher(Path("eight.onnx"), 8.0)
+    assert run(f"view left.png right.png --model eight.onnx {options}") == 0
+    assert Path(name).is_file()
+
+
+def test_the_words_after_depth_are_the_range_of_most_pixels_in_pixels_and_metres_and_the_files(
+    pictures, capfd
+):
+    save_matcher(Path("eight.onnx"), 8.0)
+    assert run("depth left.png right.png --raw --model eight.onnx --calib calib.txt -o out") == 0
+    printed = capfd.readouterr().out.splitlines()
+    # 100 px * 0.08 m / 8 px = 1 m
+    assert "disparity 8.0 to 8.0 px, depth 1.00 m to 1.00 m (98 % of the pixels)" in printed
+    files = "disparity.pfm, disparity.png, depth.png, preview.png, confidence.png, occluded.png, report.html"
+    assert printed[-2:] == [f"files: {files}", "report: out/report.html"]
+
+
 def test_a_side_by_side_picture_gives_the_same_as_the_two(pictures):
     assert run("depth left.png right.png -o two") == 0
     assert run("depth both.png -o one") == 0
@@ -312,10 +361,13 @@ def test_a_disparity_that_a_png_cannot_hold_gets_a_note_instead_of_a_png(picture
     printed, _ = capfd.readouterr()
     text = "no disparity.png: expected disparities of 0 to 255.99 px"
     (note,) = [line for line in printed.splitlines() if text in line]
-    assert note.endswith(" px; use disparity.pfm")
+    assert " px; use disparity.pfm, or disparity_scaled.png, in which px = value / 256 " in note
     assert not Path("out/disparity.png").exists()
     # The photographs do not show this disparity, so refinement moves it by at most 1 px.
     np.testing.assert_allclose(read_pfm("out/disparity.pfm"), disparity_px, atol=1.001)
+    scaled_px = read_disparity_png("out/disparity_scaled.png")
+    np.testing.assert_allclose(scaled_px, read_pfm("out/disparity.pfm"), atol=0.5 / 256)
+    assert "disparity_scaled.png" in printed.splitlines()[-2]
 
 
 def test_a_new_result_replaces_the_old_one_completely(pictures):

@@ -168,7 +168,7 @@ def test_postscript_with_the_ending_of_a_picture_is_refused(tmp_path):
     path = tmp_path / "left.png"
     path.write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 90 90\n%%EndComments\nshowpage\n")
     for read in (read_image, read_disparity_png, lambda at: read_pixels(at, "RGB")):
-        assert refusal(read, path).endswith("found another type of file")
+        assert refusal(read, path).endswith("found another type of file; save it as PNG or JPEG")
 
 
 def test_read_image_refuses_an_animation(tmp_path, picture):

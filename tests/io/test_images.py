@@ -138,13 +138,15 @@ def test_a_missing_picture_is_named(tmp_path):
 
 
 def test_a_folder_is_refused_as_a_picture(tmp_path):
-    assert refusal_of(images.read_image, tmp_path).endswith("found a folder")
+    assert refusal_of(images.read_image, tmp_path).endswith("found a folder; give the files in it")
 
 
-@pytest.mark.parametrize("content", [b"", b"hello", b"cam0=[994.978 0 311.193]\n", b"\x89PNG\r\n\x1a\n"])
+@pytest.mark.parametrize("content", [b"hello", b"cam0=[994.978 0 311.193]\n", b"\x89PNG\r\n\x1a\n"])
 def test_a_file_that_is_not_a_picture_is_named(tmp_path, content):
     (tmp_path / "picture.png").write_bytes(content)
-    assert refusal_of(images.read_image, tmp_path / "picture.png").endswith("found another type of file")
+    assert refusal_of(images.read_image, tmp_path / "picture.png").endswith(
+        "found another type of file; save it as PNG or JPEG"
+    )
 
 
 def test_a_picture_of_floats_is_refused(tmp_path):

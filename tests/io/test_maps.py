@@ -110,6 +110,40 @@ def test_a_disparity_that_a_png_cannot_hold_leaves_no_file(tmp_path, wrong_px, f
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_scaled_png_holds_negative_and_large_disparities_with_scale_and_offset(tmp_path):
+    path = tmp_path / "disparity_scaled.png"
+    maps.write_scaled_disparity_png(path, np.array([[-3.5, 0.0, 600.0, np.nan]]))
+    # From an offset of -5 to 600 are 605 px; 65,535 steps of 1/128 px are 512 px, too few, of 1/64 px enough.
+    with Image.open(path) as picture:
+        assert picture.text == {"disparity_scale_px": "0.015625", "disparity_offset_px": "-5.0"}
+    np.testing.assert_array_equal(stored(path), [[1.5 * 64, 5 * 64, 605 * 64, 0]])
+    assert maps.format_scale(0.015625, -5.0) == "value / 64 - 5"
+    assert maps.format_scale(0.25, 7.0) == "value / 4 + 7"
+
+
+@pytest.mark.parametrize(("low_px", "high_px"), [(-0.6, 40), (-640, 640), (300, 301), (0, 32766), (0, 255)])
+def test_a_scaled_png_of_any_range_is_read_back_within_half_a_step(tmp_path, rng, low_px, high_px):
+    disparity_px = rng.uniform(low_px, high_px, (30, 40)).astype(np.float32)
+    disparity_px[3, 4], disparity_px[0, 0], disparity_px[1, 1] = np.nan, low_px, high_px
+    maps.write_scaled_disparity_png(tmp_path / "scaled.png", disparity_px)
+    read_px = maps.read_disparity_png(tmp_path / "scaled.png")
+    # No power of two for a step is more than twice as large as necessary, and none is below 1/256 px.
+    step_px = max(2 * (high_px - low_px + 2) / 65535, 1 / 256)
+    np.testing.assert_allclose(read_px, disparity_px, atol=max(step_px / 2, 1 / 256))
+    assert (np.isnan(read_px) == np.isnan(disparity_px)).all()
+
+
+@pytest.mark.parametrize("text", ["a few", "nan", "inf", ""])
+def test_a_scale_that_is_no_number_is_refused(tmp_path, text):
+    path = tmp_path / "scaled.png"
+    images.save_picture(path, np.ones((2, 3), np.uint16), "PNG", texts={"disparity_scale_px": text})
+    message = refusal_of(maps.read_disparity_png, path)
+    assert (
+        f"expected numbers in the text chunks disparity_scale_px and disparity_offset_px, found {text!r}"
+        in message
+    )
+
+
 def test_a_disparity_png_of_8_bits_is_refused(tmp_path, picture):
     images.write_image(tmp_path / "disparity.png", picture[..., 0])
     assert "found mode L (PNG)" in refusal_of(maps.read_disparity_png, tmp_path / "disparity.png")

@@ -72,6 +72,35 @@ def test_the_summary_matches_the_estimate():
     assert summary.estimate_ms == 12.3
 
 
+def test_a_few_outliers_are_outside_the_range_that_the_summary_calls_the_1st_to_the_99th_percentile():
+    disparity_px = np.full((100, 200), 8, np.float32)
+    disparity_px[:, :20] = 4
+    disparity_px.flat[:100] = -70  # half a percent
+    disparity_px.flat[-100:] = 500
+    picture = np.zeros((100, 200, 3), np.uint8)
+    estimate = Estimate(
+        disparity_px=disparity_px,
+        right_disparity_px=disparity_px,
+        confidence=np.ones_like(disparity_px),
+        occluded=np.zeros(disparity_px.shape, bool),
+    )
+    summary = summary_of(StereoPair(left=picture, right=picture, camera=CAMERA), estimate, "a.png")
+    assert (summary.disparity_min_px, summary.disparity_max_px) == (-70, 500)
+    assert (summary.disparity_p1_px, summary.disparity_p99_px) == (4, 8)
+    assert (summary.depth_p1_m, summary.depth_p99_m) == (2, 4)
+
+
+def test_the_report_says_how_to_read_disparities_that_only_the_scaled_picture_holds(rng, tmp_path):
+    pair, estimate = wall(texture(rng, 40, 100), SHIFT_PX, None)
+    below = replace(estimate, disparity_px=estimate.disparity_px - 300)
+    summary = summary_of(pair, below, "a.png")
+    # From an offset of -269 px, 1 px below the least disparity, -268 px.
+    assert (summary.disparity_scale_px, summary.disparity_offset_px) == (1 / 256, -269)
+    write_report(tmp_path / "report.html", pair, estimate, summary, threads=1)
+    assert "value / 256 - 269 px" in (tmp_path / "report.html").read_text()
+    assert summary_of(pair, estimate, "a.png").disparity_scale_px is None
+
+
 def test_a_depth_is_none_without_a_camera_and_at_infinity(rng):
     photograph = texture(rng, 40, 100)
     pair, estimate = wall(photograph, SHIFT_PX, None)

@@ -131,7 +131,7 @@ def test_metres_without_a_camera_are_refused_before_anything_is_written(folder, 
 
 def test_all_without_a_camera_leaves_out_files_in_metres_with_a_note(folder):
     _, notes = make_depth(PICTURES, Path("out"), DepthJob(files=("all",)))
-    assert names_in("out") == {*ALWAYS, "disparity.npy", "disparity.tiff"}
+    assert names_in("out") == {*ALWAYS, "disparity_scaled.png", "disparity.npy", "disparity.tiff"}
     assert [note for note in notes if "(calibration, focal_px, baseline_m)" in str(note)] != []
 
 
@@ -179,6 +179,7 @@ def test_pixels_outside_the_left_image_s_content_are_unknown_in_every_file(tmp_p
     rows = {
         "disparity.pfm": (read_pfm, np.inf, 4, 0),
         "disparity.png": (read_disparity_png, np.nan, 4, 1 / 256),
+        "disparity_scaled.png": (read_disparity_png, np.nan, 4, 1 / 256),
         "disparity.npy": (np.load, np.nan, 4, 0),
         "disparity.tiff": (lambda path: np.asarray(Image.open(path)), np.nan, 4, 0),
         # 100 px * 0.08 m / 4 px
@@ -201,6 +202,8 @@ def test_the_summary_counts_only_the_left_image_s_content():
     summary = result_half_seen().summary
     # 4 px in 16 of the 48 columns, 0 px in 32; no pixel outside them is confident.
     assert (summary.disparity_median_px, summary.disparity_max_px) == (0, 4)
+    assert (summary.disparity_p1_px, summary.disparity_p99_px) == (0, 4)
+    assert (summary.depth_p1_m, summary.depth_p99_m) == (2, None)
     assert (summary.confident_percent, summary.depth_min_m) == (100, 2)
 
 
@@ -226,13 +229,13 @@ def test_a_job_cannot_be_both_refined_and_raw():
 
 
 def test_the_command_gives_the_networks_own_disparity_on_request(folder, matcher):
-    depth(Path("out"), PICTURES, raw=True)
+    depth(PICTURES, Path("out"), raw=True)
     expected = matcher.estimate(read_image("left.png"), read_image("right.png"), raw=True)
     np.testing.assert_array_equal(read_pfm("out/disparity.pfm"), expected.disparity_px)
 
 
 def test_the_command_writes_the_requested_files(folder, capfd):
-    depth(Path("out"), PICTURES, calib=Path("calib.txt"), write=["cloud.ply", "depth.npy"])
+    depth(PICTURES, Path("out"), calib=Path("calib.txt"), write=["cloud.ply", "depth.npy"])
     assert names_in("out") == {*ALWAYS, "depth.png", "cloud.ply", "depth.npy"}
     assert "report: out/report.html" in capfd.readouterr().out
 

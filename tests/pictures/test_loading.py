@@ -15,7 +15,8 @@ from stereoweave.cli.options import Format
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io.exif import Lens
 from stereoweave.io.images import read_image, write_image
-from stereoweave.pictures.loading import FORMATS, open_pictures
+from stereoweave.pictures.anaglyphs import looks_like_anaglyph
+from stereoweave.pictures.loading import FORMATS, open_pictures, pixel_factor
 from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS
 from stereoweave.rendering.layouts import LAYOUTS, LayoutOptions, add_mark, write_picture
 from stereoweave.rendering.renderer import Renderer
@@ -371,9 +372,16 @@ def test_pairs_are_seen_for_what_they_are_or_refused(tmp_path, name):
     assert guesses.count(name) >= 8
 
 
+@pytest.mark.parametrize("size_px", [(320, 280), (320, 320), (320, 336), (320, 400)])
+def test_half_width_views_of_square_and_upright_pictures_are_seen(tmp_path, size_px):
+    guesses = [seen(pair, "side_by_side_half", tmp_path) for pair in windows(*size_px)]
+    assert guesses == ["side_by_side_half"] * 9
+
+
 def test_upright_views_beside_each_other_are_not_taken_for_squeezed_ones(tmp_path):
-    guesses = [seen(pair, "side_by_side", tmp_path) for pair in windows(240, 320)]
-    assert guesses.count("side_by_side") >= 8
+    for size_px in ((240, 320), (216, 384)):
+        guesses = [seen(pair, "side_by_side", tmp_path) for pair in windows(*size_px)]
+        assert guesses.count("side_by_side") >= 8
 
 
 def test_a_guess_is_told_and_how_to_overrule_it(tmp_path, pair):
@@ -408,8 +416,43 @@ def test_an_ordinary_photograph_is_refused_with_what_to_do(tmp_path, photograph)
     assert message.startswith(
         f"{path}: expected a stereo picture, two views side by side or one above the other"
     )
+    assert (
+        "found what looks like a single photograph (its halves do not resemble each other); give two"
+        in message
+    )
     assert "; give two files, left and right; or choose one of side_by_side, " in message
     assert message.endswith(" (format)")
+
+
+@pytest.mark.parametrize("kind", [name for name in LAYOUTS if name.startswith("anaglyph")])
+@pytest.mark.parametrize("order", [(0, 1, 2), (1, 0, 2), (2, 1, 0)])  # red-cyan, green-magenta, blue-yellow
+def test_an_anaglyph_is_named(tmp_path, pair, kind, order):
+    anaglyph = LAYOUTS[kind].compose(rendered(pair), LayoutOptions())
+    write_image(tmp_path / "film.png", anaglyph[..., order])
+    message = refusal(tmp_path / "film.png")
+    assert (
+        "found an anaglyph, which mixes both views into one picture; give the two pictures it was" in message
+    )
+    assert message.endswith("top_bottom_right_first, top_bottom_right_first_half (format)")
+
+
+@pytest.mark.parametrize("photograph", ["astronaut", "coffee", "chelsea", "rocket", "retina", "colorwheel"])
+def test_an_ordinary_photograph_is_no_anaglyph(photograph):
+    assert not looks_like_anaglyph(np.ascontiguousarray(getattr(data, photograph)()[..., :3]))
+
+
+@pytest.mark.testdata
+def test_a_real_anaglyph_is_named_and_real_pairs_are_not(testdata):
+    assert "found an anaglyph" in refusal(testdata / "consumer" / "wikipedia.anaglyph.jpg")
+    others = [
+        *sorted((testdata / "stereo" / "pairs").glob("*/left.png")),
+        *(testdata / "consumer").glob("*.mpo"),
+    ]
+    assert len(others) == 13
+    others += [testdata / "consumer" / name for name in ("calf-left-right.jpg", "walrus-360.top-bottom.jpg")]
+    for path in others:
+        with Image.open(path) as picture:
+            assert not looks_like_anaglyph(np.asarray(picture.convert("RGB"))), path
 
 
 def rendered(pair):
@@ -457,9 +500,9 @@ def test_what_view_writes_without_two_eyes_is_refused_by_its_name(tmp_path, pair
 @pytest.mark.parametrize(
     ("size", "format", "found"),
     [
-        ((97, 64), "side_by_side", "even width of at least 64 pixels for two views, found 97x64"),
+        ((63, 64), "side_by_side", "even width of at least 64 pixels for two views, found 62x64"),
         ((62, 64), "crossed", "found 62x64"),
-        ((64, 97), "top_bottom", "even height"),
+        ((64, 62), "top_bottom", "even height"),
         ((96, 20), "side_by_side", "expected at least 32x32 pixels, found 48x20"),
     ],
 )
@@ -469,6 +512,35 @@ def test_what_cannot_be_halved_is_refused(tmp_path, size, format, found):
     message = refusal(path, format=format)
     assert message.startswith(f"{path}: ")
     assert found in message
+
+
+@pytest.mark.parametrize(
+    ("format", "line", "size"),
+    [
+        ("side_by_side", "column", "width"),
+        ("crossed_half", "column", "width"),
+        ("top_bottom", "row", "height"),
+    ],
+)
+def test_an_odd_line_is_dropped_and_told(tmp_path, rng, format, line, size):
+    path = tmp_path / "view.png"
+    noise = rng.integers(0, 256, (97, 101, 3), dtype=np.uint8)
+    write_image(path, noise)
+    even = noise[:, :100] if size == "width" else noise[:96]
+    write_image(tmp_path / "even.png", even)
+    opened, expected = open_pictures([path], format), open_pictures([tmp_path / "even.png"], format)
+    assert_eyes(opened, expected.pair)
+    size_px = 101 if size == "width" else 97
+    text = f"the last {line} is dropped, because the {size}, {size_px} px, is odd"
+    assert list(map(str, opened.notes)) == [text]
+    assert expected.notes == ()
+
+
+def test_an_odd_picture_is_detected_too(tmp_path, pair):
+    write_image(tmp_path / "view.png", np.hstack([pair.left, pair.right, pair.right[:, -1:]]))
+    opened = open_pictures([tmp_path / "view.png"])
+    assert opened.layout == "side_by_side"
+    assert_eyes(opened, pair)
 
 
 # Colours
@@ -578,7 +650,7 @@ def box(*brands):
         ("a.dng", b"II\x2a\0", "a camera raw file"),
         ("a.jpg", b"PK\x03\x04" + bytes(1000), "another type of file"),
         ("a.jpg", b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 90 90\n", "another type of file"),
-        ("a.jpg", b"", "another type of file"),
+        ("a.jpg", b"", "an empty file; copy it again"),
     ],
 )
 def test_what_is_not_read_is_refused_by_its_name(tmp_path, name, content, found):
@@ -604,11 +676,49 @@ def test_vr180_is_refused_by_its_name(tmp_path, pair, xmp):
     assert "found a VR180 picture or a 360-degree panorama" in refusal(path, path)
 
 
+def write_animation_of(path, *images):
+    first, *others = (Image.fromarray(image) for image in images)
+    first.save(
+        path,
+        save_all=True,
+        append_images=others,
+        duration=100,
+        **({"lossless": True} if path.suffix == ".webp" else {}),
+    )
+    return path
+
+
+@pytest.mark.parametrize(("ending", "tolerance"), [("gif", 8), ("webp", 0), ("png", 0)])
+def test_an_animation_of_two_frames_is_a_pair(tmp_path, pair, ending, tolerance):
+    path = write_animation_of(tmp_path / f"a.{ending}", pair.left, pair.right)
+    opened = open_pictures([path])
+    assert_eyes(opened, pair, tolerance)
+    assert list(map(str, opened.notes)) == [
+        "an animation of two frames, taken for the left and the right view"
+    ]
+    with Image.open(path) as picture:
+        assert pixel_factor(path, picture, None) == 2
+
+
+def test_an_animation_of_two_frames_has_no_layout_and_is_no_single_picture(tmp_path, pair):
+    path = write_animation_of(tmp_path / "a.gif", pair.left, pair.right)
+    assert refusal(path, format="side_by_side").endswith("; omit the layout (format)")
+    assert "expected one picture, found an animation of 2 frames" in refusal(path, path)
+
+
+def test_a_truncated_animation_is_refused(tmp_path, pair):
+    path = write_animation_of(tmp_path / "a.png", pair.left, pair.right)
+    path.write_bytes(path.read_bytes()[:-20_000])
+    assert re.search(r"a\.png: expected .* found .*(truncated|damaged|cannot be read)", refusal(path))
+
+
 @pytest.mark.parametrize("ending", ["gif", "webp", "png"])
-def test_an_animation_is_refused_with_the_number_of_its_pictures(tmp_path, pair, ending):
-    path = tmp_path / f"a.{ending}"
-    Image.fromarray(pair.left).save(path, save_all=True, append_images=[Image.fromarray(pair.right)])
-    assert "an animation of 2" in refusal(path)
+def test_a_longer_animation_is_refused_with_the_number_of_its_pictures(tmp_path, pair, ending):
+    path = write_animation_of(tmp_path / f"a.{ending}", pair.left, pair.right, pair.left)
+    assert refusal(path) == (
+        f"{path}: expected one picture, or an animation of two frames, left and right, found an animation of "
+        "3 frames; save its two views as separate pictures"
+    )
 
 
 @pytest.mark.parametrize(

@@ -266,6 +266,24 @@ def test_a_bad_line_is_told_by_its_number(tmp_path):
         read_pair_list(tmp_path / "none.txt")
 
 
+def test_one_pattern_alone_and_two_folders_are_refused_with_what_to_give(tmp_path):
+    with pytest.raises(
+        StereoweaveError, match=r"found none of the right ones; give both, .*\(left, right\)$"
+    ):
+        find_pairs([], "*_l.png", None, None)
+    with pytest.raises(StereoweaveError, match=r"found none of the left ones; give both"):
+        find_pairs([], None, "*_r.png", None)
+    with pytest.raises(
+        StereoweaveError, match=r"found two folders: .* such as 'left/\*.png' \(left, right\)$"
+    ):
+        find_pairs([tmp_path, tmp_path], None, None, None)
+
+
+def test_a_folder_whose_names_have_no_side_gets_a_note(tmp_path):
+    (note,) = find_pairs_in(put(tmp_path, "1.png", "2.png")).notes
+    assert note.endswith("as 1_L.jpg and 1_R.jpg do, so each picture is taken to hold both views")
+
+
 def test_the_words_of_the_command_line_name_one_source(tmp_path):
     folder = put(tmp_path, "a_l.png", "a_r.png")
     left, right = (str(folder / f"a_{side}.png") for side in "lr")
@@ -278,7 +296,6 @@ def test_the_words_of_the_command_line_name_one_source(tmp_path):
     for words, found in {
         ((), None, None, None): "none",
         ((folder,), left, right, None): "pictures and patterns",
-        ((), left, None, None): "only one of the two patterns",
     }.items():
         with pytest.raises(
             StereoweaveError, match=f"or a list of pairs, found {found}; .*(left, right, listed)"

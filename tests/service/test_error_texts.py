@@ -21,8 +21,9 @@ LOWER = {"left": "upper.png", "right": "lower.png"}
 Ask = Callable[..., httpx.Response]
 
 ERRORS: dict[str, tuple[str, dict[str, str], dict[str, Any]]] = {
-    "picture: expected a stereo picture, two views side by side or one above the other, found halves that do "
-    f"not resemble each other; give two files, left and right; or choose one of {LAYOUTS} (format)": (
+    "picture: expected a stereo picture, two views side by side or one above the other, found what looks "
+    "like a single photograph (its halves do not resemble each other); give two files, left and right; or "
+    f"choose one of {LAYOUTS} (format)": (
         "/disparity",
         {"picture": "left.png"},
         {},
