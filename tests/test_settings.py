@@ -34,12 +34,12 @@ SHARED = {"cameras", "matching", "outputs", "pictures", "rendering"}
 # Settings of these subpackages that the page and the service do not offer.
 ABSENT = {
     "page": {
-        *("board", "convergence_px", "crop", "files", "forward", "layout", "left", "listed", "out"),
+        *("align", "board", "convergence_px", "crop", "files", "forward", "layout", "left", "listed", "out"),
         *("position", "provider", "range_px", "raw", "refined", "right", "strength", "up"),
     },
     "service": {
-        *("board", "convergence_px", "crop", "files", "forward", "layout", "left", "listed", "out"),
-        *("provider", "raw"),
+        *("align", "board", "convergence_px", "crop", "files", "forward", "layout", "left", "listed"),
+        *("no_rectify", "out", "provider", "raw"),
         *("right", "up"),
     },
 }
@@ -82,7 +82,7 @@ SHARED_SETTINGS = {setting for module, setting in SETTINGS if module.split("/")[
 def test_a_command_has_an_option_for_each_setting():
     options = [option_names(command) for command in list_commands(typer.main.get_command(app))]
     unknown = {name for _, name in SETTINGS if not any(option_of(name) for option_of in options)}
-    assert unknown == {"split"}  # a setting of recipes only
+    assert unknown == {"split", "align"}  # settings of recipes only, and of Python only
 
 
 def test_the_service_has_a_field_for_each_setting_that_it_offers():

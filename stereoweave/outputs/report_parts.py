@@ -22,6 +22,7 @@ from stereoweave.outputs.viewer import viewer_script
 CONTENTS = {
     "disparity.pfm": "disparity in pixels, float32",
     "disparity.png": "disparity, pixels × 256, 16 bits",
+    "disparity_scaled.png": "disparity with the scale and offset above, 16 bits",
     "disparity.npy": "disparity in pixels, for NumPy",
     "disparity.tiff": "disparity in pixels, float32",
     "depth.png": "depth in millimetres, 16 bits",

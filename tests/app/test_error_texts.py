@@ -37,10 +37,6 @@ NOTES: dict[str, tuple[dict[str, str], dict[str, Any]]] = {
         {"left": "both.png"},
         {},
     ),
-    "the right picture is 2.0 px lower than the left one; rectify the pair (“Align the pictures”)": (
-        {"left": "upper.png", "right": "lower.png"},
-        {"rectify": False},
-    ),
 }
 
 

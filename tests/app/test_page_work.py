@@ -300,6 +300,7 @@ def test_pictures_that_do_not_fit_get_a_banner(visit, tmp_path):
     write_image(tmp_path / "left.png", left)
     write_image(tmp_path / "right.png", np.roll(right, 12, axis=0))
     visit.give(left=tmp_path / "left.png", right=tmp_path / "right.png")
+    visit.page.locator("#rectify input").uncheck()
     visit.find()
     banner = visit.page.locator("#status .warning")
     assert "“Align the pictures”" in banner.inner_text()

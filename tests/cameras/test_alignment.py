@@ -111,6 +111,7 @@ def test_pictures_of_two_scenes_and_plain_ones_are_told_apart(pairs):
     assert unrelated.defects == ("unrelated",)
     assert unrelated.lines() == unrelated.warnings()
     assert str(unrelated.lines()[0]).startswith("expected two pictures of the same scene, found ")
+    assert str(unrelated.lines()[0]).endswith("; give the two pictures of one pair")
     plain = np.full((100, 200, 3), 90, np.uint8)
     found = check_pair(plain, plain)
     assert found.defects == ("too_few_matches",)
@@ -125,6 +126,7 @@ def test_one_picture_given_twice_is_named(pairs):
         found = check_pair(left, right)
         assert found.defects == ("same_picture",)
         assert str(found.warnings()[0]).startswith("left and right show the same view: ")
+        assert str(found.warnings()[0]).endswith("; give two pictures from two positions")
 
 
 def test_each_defect_has_a_note(pairs):

@@ -240,7 +240,7 @@ def test_pictures_of_other_kinds_work(pictures, kind):
 
 
 def test_depth_writes_what_the_matcher_finds(pictures):
-    assert run("depth left.png right.png --calib calib.txt -o new/out") == 0
+    assert run("depth left.png right.png --model small --calib calib.txt -o new/out") == 0
     names = [
         "confidence.png",
         "depth.png",

@@ -143,7 +143,8 @@ def test_a_path_is_read_and_turned_upright(tmp_path, as_kind):
 def test_a_path_that_cannot_be_read_is_named_with_the_reason(tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(
-        FormatError, match=r"^(missing.png|\.): expected a picture .*(no such file|a folder)$"
+        FormatError,
+        match=r"^(missing.png|\.): expected a picture .*(no such file|a folder; give the files in it)$",
     ):
         as_rgb(name, "left")
 

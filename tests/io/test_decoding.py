@@ -73,7 +73,7 @@ def by_service(folder: Path):
 def by_page(folder: Path):
     pictures = folder / "left.png", folder / "right.png"
     uploads = page_kept.Uploads(pictures=pictures, request=Request(), backend=Backend())
-    return page_kept.match_uploads(uploads, folder / "kept", lambda *_: None).result.pair
+    return page_kept.match_uploads(uploads, lambda *_: None).pair
 
 
 def by_video(folder: Path):

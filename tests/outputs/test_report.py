@@ -96,7 +96,7 @@ def test_the_report_says_how_to_read_disparities_that_only_the_scaled_picture_ho
     summary = summary_of(pair, below, "a.png")
     # From an offset of -269 px, 1 px below the least disparity, -268 px.
     assert (summary.disparity_scale_px, summary.disparity_offset_px) == (1 / 256, -269)
-    write_report(tmp_path / "report.html", pair, estimate, summary, threads=1)
+    write_report(tmp_path / "report.html", pair, estimate, summary, Context())
     assert "value / 256 - 269 px" in (tmp_path / "report.html").read_text()
     assert summary_of(pair, estimate, "a.png").disparity_scale_px is None
 

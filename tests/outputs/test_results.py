@@ -229,7 +229,7 @@ def test_a_job_cannot_be_both_refined_and_raw():
 
 
 def test_the_command_gives_the_networks_own_disparity_on_request(folder, matcher):
-    depth(PICTURES, Path("out"), raw=True)
+    depth(PICTURES, Path("out"), raw=True, model="small")
     expected = matcher.estimate(read_image("left.png"), read_image("right.png"), raw=True)
     np.testing.assert_array_equal(read_pfm("out/disparity.pfm"), expected.disparity_px)
 
