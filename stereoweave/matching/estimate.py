@@ -30,6 +30,7 @@ from stereoweave.matching.providers import CPU
 from stereoweave.matching.refine import right_confidence
 from stereoweave.matching.upsample import enlarge
 from stereoweave.stereo import LONGEST_SIDE_PX, Estimate, StereoPair
+from stereoweave.system.steps import step
 
 # Where the true disparity is outside a network's range, the network often predicts the end of the range, with
 # a confidence between these two values.
@@ -116,6 +117,7 @@ def match(matcher: Matcher, pair: StereoPair, options: MatchOptions = DEFAULT_OP
     return found
 
 
+@step("matching")
 def match_many(
     matcher: Matcher, pairs: Sequence[StereoPair], options: MatchOptions = DEFAULT_OPTIONS
 ) -> list[Estimate]:

@@ -16,6 +16,7 @@ from jaxtyping import Float, Float32, UInt8, UInt16
 from stereoweave.matching.exposure import match_exposure, recolour
 from stereoweave.matching.left_right_check import at_match, find_occluded
 from stereoweave.stereo import Estimate, StereoPair, check_fits
+from stereoweave.system.steps import step
 from stereoweave.system.threads import in_bands, thread_count
 
 if TYPE_CHECKING:
@@ -38,6 +39,7 @@ _SAME_PX = 1.0
 _MOST_THREADS = 4
 
 
+@step("refining")
 def refine(
     left: UInt8[np.ndarray, "h w 3"],
     right: UInt8[np.ndarray, "h w 3"],
