@@ -1,14 +1,17 @@
 """Names of the running command's options, used for settings in error messages and notes."""
 
+import functools
 from collections.abc import Callable
 from contextvars import ContextVar
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ParamSpec
 
 import typer
 from typer.core import TyperCommand
 
 from stereoweave.errors import NameOf, StereoweaveError, keyword
+
+Given = ParamSpec("Given")
 
 # Parameters of commands, by setting, where the parameter has another name.
 _PARAMETERS = {
@@ -49,6 +52,19 @@ _running: ContextVar[NameOf] = ContextVar("names of the running command's option
 def running_options() -> NameOf:
     """Return the names of the running command's options; keywords if no command is running."""
     return _running.get()
+
+
+def shows_steps(command: Callable[Given, None]) -> Callable[Given, None]:
+    """Make a command show its steps on stderr; see `progress.show_steps`."""
+
+    @functools.wraps(command)
+    def run(*args: Given.args, **kwargs: Given.kwargs) -> None:
+        from stereoweave.system.progress import show_steps  # imports rich, for which --help need not wait
+
+        with show_steps():
+            command(*args, **kwargs)
+
+    return run
 
 
 class Command(TyperCommand):

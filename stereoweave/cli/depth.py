@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stereoweave.cli.commands import running_options
+from stereoweave.cli.commands import running_options, shows_steps
 from stereoweave.cli.options import (
     AsJson,
     BaselineM,
@@ -67,6 +67,7 @@ FocalError = Annotated[float, typer.Option(min=0, help="Uncertainty of the focal
 BaselineError = Annotated[float, typer.Option(min=0, help="Uncertainty of the baseline, in percent.")]
 
 
+@shows_steps
 def depth(  # noqa: PLR0913 - each is an option of the command line
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write the results to.")],
     pictures: PicturesOrFolder = None,
@@ -111,6 +112,7 @@ def depth(  # noqa: PLR0913 - each is an option of the command line
     (_print_json if as_json else _print_summary)(summary, lines, out)
 
 
+@shows_steps
 def measure(  # noqa: PLR0913 - each is an option of the command line
     pictures: Pictures,
     first: Annotated[

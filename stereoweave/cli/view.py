@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stereoweave.cli.commands import running_options
+from stereoweave.cli.commands import running_options, shows_steps
 from stereoweave.cli.options import (
     Format,
     Model,
@@ -77,6 +77,7 @@ Calib = Annotated[
 ]
 
 
+@shows_steps
 def view(  # noqa: PLR0913 - each is an option of the command line
     pictures: Pictures,
     out: Out,
