@@ -55,16 +55,31 @@ def running_options() -> NameOf:
 
 
 def shows_steps(command: Callable[Given, None]) -> Callable[Given, None]:
-    """Make a command show its steps on stderr; see `progress.show_steps`."""
+    """Make a command show its steps on stderr, and compile kernels ahead of their use.
+
+    See `progress.show_steps` and `kernel_cache.compile_ahead`.
+    """
 
     @functools.wraps(command)
     def run(*args: Given.args, **kwargs: Given.kwargs) -> None:
-        from stereoweave.system.progress import show_steps  # imports rich, for which --help need not wait
+        # They import rich and filelock, for which --help need not wait.
+        from stereoweave.system.kernel_cache import compiling_ahead
+        from stereoweave.system.progress import show_steps
 
-        with show_steps():
+        with show_steps(), compiling_ahead():
             command(*args, **kwargs)
 
     return run
+
+
+def compile_ahead_for_views(refined: bool) -> None:
+    """Start to compile the kernels that render views and, on request, those that refine the disparity."""
+    from stereoweave.matching.refine import rehearse_refining
+    from stereoweave.rendering.rehearsals import rehearse_drawing, rehearse_filling
+    from stereoweave.system.kernel_cache import compile_ahead
+
+    refining = [rehearse_refining] if refined else []
+    compile_ahead(rehearse_drawing, *refining, rehearse_filling)
 
 
 class Command(TyperCommand):

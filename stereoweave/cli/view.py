@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stereoweave.cli.commands import running_options, shows_steps
+from stereoweave.cli.commands import compile_ahead_for_views, running_options, shows_steps
 from stereoweave.cli.options import (
     Format,
     Model,
@@ -100,6 +100,7 @@ def view(  # noqa: PLR0913 - each is an option of the command line
 
     Layouts are for 3-D viewers and displays.
     """
+    compile_ahead_for_views(refined=True)
     from stereoweave.cameras.diagnosis import find_problems
     from stereoweave.cameras.rectify import crop
     from stereoweave.matching.backend import Backend

@@ -164,6 +164,12 @@ def enlarge(
     return estimate
 
 
+def rehearse_upsampling() -> None:
+    """Upsample a small estimate, to compile all kernels (`kernel_cache.compile_ahead`)."""
+    image, px = np.zeros((64, 64, 3), np.uint8), np.zeros((32, 32), np.float32)
+    enlarge(image, image, Estimate(disparity_px=px, right_disparity_px=px, confidence=px, occluded=px > 0), 1)
+
+
 def _divisors(width: int, smaller: int) -> list[int]:
     """Return the downscaling factor of each level; the last factor is 1."""
     divisor = 1
