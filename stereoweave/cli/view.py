@@ -22,6 +22,7 @@ from stereoweave.cli.options import (
     parse_range_px,
 )
 from stereoweave.errors import StereoweaveError
+from stereoweave.system.steps import step
 
 if TYPE_CHECKING:
     from stereoweave.rendering.layouts import LayoutOptions
@@ -202,6 +203,7 @@ def _write_view(out: Path, view: "View", position: float) -> str:
     return f"view at {position:g}, {100 * (~view.drawn).mean():.1f} % of it seen by neither camera"
 
 
+@step("rendering views")
 def _write_layout(out: Path, name: str, renderer: "Renderer", layout_options: "LayoutOptions") -> str:
     """Write several views in a layout, and return a description of the file for the user."""
     from stereoweave.io.animation import write_animation
