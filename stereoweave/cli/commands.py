@@ -72,13 +72,14 @@ def shows_steps(command: Callable[Given, None]) -> Callable[Given, None]:
     return run
 
 
-def compile_ahead_for_views(refined: bool) -> None:
-    """Start to compile the kernels that render views and, on request, those that refine the disparity."""
+def compile_ahead_for_views(refined: bool, model: str) -> None:
+    """Start to compile the kernels that render views and, if needed, those that refine the disparity."""
+    from stereoweave.matching.matcher import MODES
     from stereoweave.matching.refine import rehearse_refining
     from stereoweave.rendering.rehearsals import rehearse_drawing, rehearse_filling
     from stereoweave.system.kernel_cache import compile_ahead
 
-    refining = [rehearse_refining] if refined else []
+    refining = [rehearse_refining] if refined or (model in MODES and MODES[model].refined) else []
     compile_ahead(rehearse_drawing, *refining, rehearse_filling)
 
 

@@ -90,7 +90,7 @@ def depth(  # noqa: PLR0913 - each is an option of the command line
     as_json: AsJson = False,
 ) -> None:
     """Estimate the depth of one or many stereo pairs. Writes maps, previews and an HTML report."""
-    compile_ahead_for_views(refined)
+    compile_ahead_for_views(refined, model)
     from stereoweave.matching.backend import Backend
     from stereoweave.matching.options import MatchOptions
     from stereoweave.outputs.results import DepthJob, make_depth

@@ -101,7 +101,7 @@ def view(  # noqa: PLR0913 - each is an option of the command line
 
     Layouts are for 3-D viewers and displays.
     """
-    compile_ahead_for_views(refined=True)
+    compile_ahead_for_views(True, model)
     from stereoweave.cameras.diagnosis import find_problems
     from stereoweave.cameras.rectify import crop
     from stereoweave.matching.backend import Backend
