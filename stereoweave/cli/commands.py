@@ -1,15 +1,18 @@
 """The running command: its words, and the names of its options for settings in error messages and notes."""
 
+import functools
 import shlex
 from collections.abc import Callable
 from contextvars import ContextVar
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ParamSpec
 
 import typer
 from typer.core import TyperCommand
 
 from stereoweave.errors import NameOf, StereoweaveError, keyword
+
+Given = ParamSpec("Given")
 
 # Parameters of commands, by setting, where the parameter has another name.
 _PARAMETERS = {
@@ -61,6 +64,35 @@ def running_command() -> str:
 def running_options() -> NameOf:
     """Return the names of the running command's options; keywords if no command is running."""
     return _running.get()
+
+
+def shows_steps(command: Callable[Given, None]) -> Callable[Given, None]:
+    """Make a command show its steps on stderr, and compile kernels ahead of their use.
+
+    See `progress.show_steps` and `kernel_cache.compile_ahead`.
+    """
+
+    @functools.wraps(command)
+    def run(*args: Given.args, **kwargs: Given.kwargs) -> None:
+        # They import rich and filelock, for which --help need not wait.
+        from stereoweave.system.kernel_cache import compiling_ahead
+        from stereoweave.system.progress import show_steps
+
+        with show_steps(), compiling_ahead():
+            command(*args, **kwargs)
+
+    return run
+
+
+def compile_ahead_for_views(refined: bool, model: str) -> None:
+    """Start to compile the kernels that render views and, if needed, those that refine the disparity."""
+    from stereoweave.matching.matcher import MODES
+    from stereoweave.matching.refine import rehearse_refining
+    from stereoweave.rendering.rehearsals import rehearse_drawing, rehearse_filling
+    from stereoweave.system.kernel_cache import compile_ahead
+
+    refining = [rehearse_refining] if refined or (model in MODES and MODES[model].refined) else []
+    compile_ahead(rehearse_drawing, *refining, rehearse_filling)
 
 
 class Command(TyperCommand):

@@ -10,7 +10,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stereoweave.cli.commands import running_command, running_options
+from stereoweave.cli.commands import (
+    compile_ahead_for_views,
+    running_command,
+    running_options,
+    shows_steps,
+)
 from stereoweave.cli.options import (
     AsJson,
     BaselineM,
@@ -83,6 +88,7 @@ FocalError = Annotated[float, typer.Option(min=0, help="Uncertainty of the focal
 BaselineError = Annotated[float, typer.Option(min=0, help="Uncertainty of the baseline, in percent.")]
 
 
+@shows_steps
 def depth(  # noqa: PLR0913 - each is an option of the command line
     pictures: PicturesOrFolder = None,
     out: Out = None,
@@ -105,6 +111,7 @@ def depth(  # noqa: PLR0913 - each is an option of the command line
     as_json: AsJson = False,
 ) -> None:
     """Estimate the depth of one or many stereo pairs. Writes maps, previews and an HTML report."""
+    compile_ahead_for_views(refined, model)
     from stereoweave.matching.backend import Backend
     from stereoweave.matching.options import MatchOptions
     from stereoweave.outputs.results import DepthJob, make_depth
@@ -142,6 +149,7 @@ def _name_results(pictures: Sequence[Path], left: str | None, listed: Path | Non
     return Path(f"{name}_depth" if name else "depth")
 
 
+@shows_steps
 def measure(  # noqa: PLR0913 - each is an option of the command line
     pictures: Pictures,
     first: Annotated[

@@ -10,11 +10,13 @@ from typing import Annotated
 
 import typer
 
-from stereoweave.cli.commands import running_options
+from stereoweave.cli.commands import running_options, shows_steps
 from stereoweave.cli.options import AsJson, Calib, Format, Pictures, make_parent_folder
 from stereoweave.errors import StereoweaveError
+from stereoweave.system.steps import step
 
 
+@shows_steps
 def check(pictures: Pictures, format: Format = None, as_json: AsJson = False) -> None:
     """Check a pair for problems, and report each with its remedy.
 
@@ -25,7 +27,8 @@ def check(pictures: Pictures, format: Format = None, as_json: AsJson = False) ->
     from stereoweave.pictures.loading import open_pictures
 
     opened = open_pictures(pictures, format)
-    found = check_pair(opened.pair.left, opened.pair.right)
+    with step("checking the pair"):
+        found = check_pair(opened.pair.left, opened.pair.right)
     notes = [note.format(_name_remedy) for note in (*opened.notes, *found.lines())]
     if as_json:
         facts = {name: _replace_nan(value) for name, value in asdict(found).items()}
@@ -48,6 +51,7 @@ def _replace_nan(value: object) -> object:
     return None if isinstance(value, float) and math.isnan(value) else value
 
 
+@shows_steps
 def rectify(
     pictures: Pictures,
     out: Annotated[

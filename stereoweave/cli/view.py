@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stereoweave.cli.commands import running_options
+from stereoweave.cli.commands import compile_ahead_for_views, running_options, shows_steps
 from stereoweave.cli.options import (
     Format,
     Model,
@@ -96,6 +96,7 @@ Calib = Annotated[
 ]
 
 
+@shows_steps
 def view(  # noqa: PLR0913 - each is an option of the command line
     pictures: Pictures,
     out: Out = None,
@@ -120,6 +121,7 @@ def view(  # noqa: PLR0913 - each is an option of the command line
 
     Layouts are for 3-D viewers and displays.
     """
+    compile_ahead_for_views(True, model)
     from stereoweave.cameras.diagnosis import find_problems
     from stereoweave.cameras.rectify import crop as crop_to_content
     from stereoweave.matching.backend import Backend

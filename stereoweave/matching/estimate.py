@@ -24,8 +24,10 @@ from stereoweave.matching.matcher import (
 )
 from stereoweave.matching.options import DEFAULT_OPTIONS, MatchOptions
 from stereoweave.matching.refine import right_confidence
-from stereoweave.matching.upsample import enlarge
+from stereoweave.matching.upsample import enlarge, rehearse_upsampling
 from stereoweave.stereo import LONGEST_SIDE_PX, Estimate, StereoPair
+from stereoweave.system.kernel_cache import compile_ahead
+from stereoweave.system.steps import step
 
 # Where the true disparity is outside a network's range, the network often predicts the end of the range, with
 # a confidence between these two values.
@@ -76,10 +78,13 @@ def match(matcher: Matcher, pair: StereoPair, options: MatchOptions = DEFAULT_OP
     return found
 
 
+@step("matching")
 def match_many(
     matcher: Matcher, pairs: Sequence[StereoPair], options: MatchOptions = DEFAULT_OPTIONS
 ) -> list[Estimate]:
     """Match pairs of any size as `match` does, in batches of pairs with the same network input size."""
+    if not all(matcher.sees_whole(*pair.left.shape[1::-1]) for pair in pairs):
+        compile_ahead(rehearse_upsampling)
     every_shown = [_prepare_first_input(matcher, pair, options.range_px) for pair in pairs]
     moved = [_shift(shown) for shown in every_shown]
     of_size: dict[tuple[int, ...], list[int]] = {}

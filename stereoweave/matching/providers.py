@@ -56,7 +56,7 @@ def _cuda_options(threads: int) -> dict[str, str]:
 
 def _tensorrt_options(threads: int) -> dict[str, str]:
     """Return options that cache engines, which take minutes to build, if the cache folder is writable."""
-    from stereoweave.system.jit import cache_folder  # imports Numba
+    from stereoweave.system.kernel_cache import cache_folder
 
     folder = cache_folder().with_name("tensorrt")
     try:

@@ -16,6 +16,7 @@ from jaxtyping import Float, Float32, UInt8, UInt16
 from stereoweave.matching.exposure import match_exposure, recolour
 from stereoweave.matching.left_right_check import at_match, find_occluded
 from stereoweave.stereo import Estimate, StereoPair, check_fits
+from stereoweave.system.steps import step
 from stereoweave.system.threads import in_bands, thread_count
 
 if TYPE_CHECKING:
@@ -38,6 +39,7 @@ _SAME_PX = 1.0
 _MOST_THREADS = 4
 
 
+@step("refining")
 def refine(
     left: UInt8[np.ndarray, "h w 3"],
     right: UInt8[np.ndarray, "h w 3"],
@@ -71,6 +73,12 @@ def refine(
         confidence=estimate.confidence,
         occluded=find_occluded(disparity_px, right_disparity_px),
     )
+
+
+def rehearse_refining() -> None:
+    """Refine a small estimate, to compile all kernels (`kernel_cache.compile_ahead`)."""
+    image, px = np.zeros((32, 32, 3), np.uint8), np.zeros((32, 32), np.float32)
+    refine(image, image, Estimate(disparity_px=px, right_disparity_px=px, confidence=px, occluded=px > 0), 1)
 
 
 def _settle(

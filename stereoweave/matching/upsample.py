@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Float32, Int, Int16, Shaped, UInt8, UInt16, U
 
 from stereoweave.matching.left_right_check import find_occluded
 from stereoweave.stereo import Estimate
+from stereoweave.system.steps import step
 from stereoweave.system.threads import in_bands, thread_count
 
 # Memory limit for the cost volumes of a strip.
@@ -153,10 +154,20 @@ def enlarge(
         threads: Maximum number of threads; default: all cores.
     """
     height, width = left.shape[:2]
-    for divisor in _divisors(width, estimate.disparity_px.shape[1]):
-        size = round(width / divisor), round(height / divisor)
-        estimate = _upsample_level(_grey(left, size), _grey(right, size), estimate, thread_count(threads))
+    divisors, threads = _divisors(width, estimate.disparity_px.shape[1]), thread_count(threads)
+    sizes = [(round(width / divisor), round(height / divisor)) for divisor in divisors]
+    # Both views are matched strip by strip, once upwards and once downwards.
+    pixels = sum(2 * 2 * columns * rows for columns, rows in sizes)
+    with step("upsampling", total=pixels) as advance:
+        for size in sizes:
+            estimate = _upsample_level(_grey(left, size), _grey(right, size), estimate, threads, advance)
     return estimate
+
+
+def rehearse_upsampling() -> None:
+    """Upsample a small estimate, to compile all kernels (`kernel_cache.compile_ahead`)."""
+    image, px = np.zeros((64, 64, 3), np.uint8), np.zeros((32, 32), np.float32)
+    enlarge(image, image, Estimate(disparity_px=px, right_disparity_px=px, confidence=px, occluded=px > 0), 1)
 
 
 def _divisors(width: int, smaller: int) -> list[int]:
@@ -174,12 +185,16 @@ def _grey(image: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]) -> UInt8[np.
 
 
 def _upsample_level(
-    left: UInt8[np.ndarray, "h w"], right: UInt8[np.ndarray, "h w"], smaller: Estimate, threads: int
+    left: UInt8[np.ndarray, "h w"],
+    right: UInt8[np.ndarray, "h w"],
+    smaller: Estimate,
+    threads: int,
+    advance: Callable[[int], None],
 ) -> Estimate:
-    """Upsample an estimate to the size of the given grey images."""
+    """Upsample an estimate to the size of the given grey images; `advance` is told each strip's pixels."""
     view = _StripView(left, right, smaller.disparity_px)
     right_view = _StripView(_mirror(right), _mirror(left), _mirror(smaller.right_disparity_px))
-    found_px, right_found_px = _match_view(view, threads), _match_view(right_view, threads)
+    found_px, right_found_px = (_match_view(each, threads, advance) for each in (view, right_view))
     disparity_px, doubt = _settle(view, found_px, _mirror(right_found_px), threads)
     right_disparity_px = _mirror(_settle(right_view, right_found_px, _mirror(found_px), threads)[0])
     del view, right_view, found_px, right_found_px  # as large as the result: 1 GB for 50 megapixels
@@ -191,7 +206,7 @@ def _upsample_level(
     )
 
 
-def _match_view(view: _StripView, threads: int) -> Float32[np.ndarray, "h w"]:
+def _match_view(view: _StripView, threads: int, advance: Callable[[int], None]) -> Float32[np.ndarray, "h w"]:
     """Match a left view strip by strip, and return its disparities of least cost."""
     from stereoweave.matching import upsample_kernels as kernels
 
@@ -207,6 +222,7 @@ def _match_view(view: _StripView, threads: int) -> Float32[np.ndarray, "h w"]:
         from_below[rows.start] = _Paths(*(values.copy() for values in paths))
         if rows.start > 0:
             _Strip(view, rows, costs, sums, threads).run_down(paths, backwards=1)
+        advance(width * (rows.stop - rows.start))
     paths = _no_paths(width)
     for rows in strips:
         strip = _Strip(view, rows, costs, sums, threads)
@@ -214,6 +230,7 @@ def _match_view(view: _StripView, threads: int) -> Float32[np.ndarray, "h w"]:
         strip.run_down(paths, backwards=0)
         strip.run_down(from_below[rows.start], backwards=1)
         strip.pick(found_px[rows])
+        advance(width * (rows.stop - rows.start))
     return found_px
 
 

@@ -138,13 +138,14 @@ def along_columns(costs, first_candidate, large_step, backwards, columns, paths,
     for i in range(height):
         y = height - 1 - i if backwards else i
         for x in range(columns[0], columns[1]):
-            before[:] = paths[x]
+            for k in range(PATH):  # not [:], which takes as long to compile as all the rest
+                before[k] = paths[x, k]
             first = first_candidate[y, x]
             jump = large_step[y + backwards, x]
             least[x] = _step_both(
                 before, least[x], first, first_before[x], costs[y, x], jump, paths[x], sums[y, x]
             )
-            first_before[x] = first
+            first_before[x, 0], first_before[x, 1] = first[0], first[1]
 
 
 @kernel

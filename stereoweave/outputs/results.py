@@ -47,6 +47,7 @@ from stereoweave.outputs.report_parts import CONTENTS
 from stereoweave.outputs.run import Result, run
 from stereoweave.pictures.prepare import Request, prepare
 from stereoweave.stereo import StereoPair
+from stereoweave.system.steps import step
 
 
 def _write_preview(path: Path, result: Result) -> None:
@@ -209,6 +210,7 @@ def _write_together(out: Path) -> Iterator[Path]:
                     (out / file).unlink(missing_ok=True)
 
 
+@step("writing the files")
 def write_files(folder: Path, files: Sequence[str], result: Result) -> list[Note]:
     """Write the given output files of a result. Returns a note for each file that is skipped or thinned."""
     notes = []

@@ -20,6 +20,7 @@ from stereoweave.outputs.point_cloud import Mesh, PointCloud, make_mesh, make_po
 from stereoweave.outputs.report import Summary, summarize
 from stereoweave.pictures.prepare import Prepared
 from stereoweave.stereo import Estimate, StereoPair
+from stereoweave.system.steps import step
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,6 +64,7 @@ class Result:
         depth_m = require_camera(self.pair).depth_m(self.estimate.disparity_px)
         return np.where(self.seen, depth_m, np.float32(unknown))
 
+    @step("checking the pair")
     def warnings(self) -> list[Note]:
         """Return notes on likely defects of the pair.
 

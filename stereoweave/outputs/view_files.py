@@ -27,6 +27,7 @@ from stereoweave.rendering.layouts import (
 from stereoweave.rendering.renderer import Renderer, check_position
 from stereoweave.rendering.scaling import fit_size, scale_down
 from stereoweave.stereo import Estimate, StereoPair
+from stereoweave.system.steps import step
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,6 +120,7 @@ class ViewFile:
         invented_percent = 100 * (~view.drawn[part]).mean()
         return f"view at {self.position:g}, {invented_percent:.1f} % of it seen by neither camera"
 
+    @step("rendering views")
     def _write_layout(self, renderer: Renderer, name: str) -> str:
         part = self._find_part(renderer)
         if name in LAYOUTS:

@@ -28,6 +28,7 @@ from stereoweave.pictures.pair_layouts import (
     measure_resemblance,
 )
 from stereoweave.stereo import StereoPair
+from stereoweave.system.steps import step
 
 # Layouts of one file with both views: the layout of one picture, or a file format with two pictures.
 FORMATS = (*PAIR_LAYOUTS, "mpo", "jps")
@@ -61,6 +62,7 @@ class Opened:
     lens: exif.Lens | None = None
 
 
+@step("opening the pictures")
 def open_pictures(paths: Sequence[Path], format: str | None = None) -> Opened:
     """Open the pair in two pictures, left first, or in one file with both views.
 

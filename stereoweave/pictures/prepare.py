@@ -14,6 +14,7 @@ from stereoweave.errors import Note, Remedy, StereoweaveError
 from stereoweave.io.exif import Lens
 from stereoweave.pictures.loading import open_pictures
 from stereoweave.stereo import StereoCamera, StereoPair
+from stereoweave.system.steps import step
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,6 +55,7 @@ class Prepared:
     alignment: Alignment | None = None
 
 
+@step("opening the pictures")
 def prepare(pictures: Sequence[Path], request: Request) -> Prepared:
     """Open a pair from two pictures (left first) or one picture with both views; rectify it if needed.
 

@@ -112,7 +112,8 @@ def _fill_pixel(canvas, y, u, source, colour, mirrors):
     mirrored = min(max(2 * source - u, 0), width - 1)
     apart_px = abs(canvas.surface_px[y, mirrored] - canvas.surface_px[y, source])
     if mirrors and canvas.pure[y, mirrored] and apart_px <= SAME_SURFACE_PX:
-        canvas.image[y, u] = canvas.image[y, mirrored]
+        for channel in range(3):
+            canvas.image[y, u, channel] = canvas.image[y, mirrored, channel]
     else:
         canvas.image[y, u, 0], canvas.image[y, u, 1], canvas.image[y, u, 2] = colour
     canvas.surface_px[y, u], canvas.drawn[y, u] = canvas.surface_px[y, source], False

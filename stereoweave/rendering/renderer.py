@@ -120,12 +120,12 @@ class Renderer:
         in_bands(work, len(canvas.image), self._threads, self._threads)
         if not 0 <= position <= 1:
             # Between the cameras, holes are only a few pixels wide: `fill` alone is faster and as good.
-            hidden = self._find_background(right=position > 1)
+            hidden = self.find_background(right=position > 1)
             paint_background(*hidden, (right if position > 1 else left).shift, left.offset_px, canvas)
         fill(canvas)
         return canvas
 
-    def _find_background(self, right: bool) -> "HiddenBackground":
+    def find_background(self, right: bool) -> "HiddenBackground":
         """Return the background that neither camera sees but that is visible from beyond one of them."""
         if right not in self._hidden:
             self._hidden[right] = _uncover_background(self._sides, right, self._threads)

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextvars import copy_context
 
 from stereoweave.arguments import check_whole_number
 from stereoweave.errors import StereoweaveError
@@ -35,5 +36,7 @@ def usable_cores() -> int:
 def in_bands(work: Callable[[int, int], None], height: int, count: int, threads: int) -> None:
     """Call `work(first_row, end_row)` for each of `count` bands of rows, in several threads."""
     ends = [height * band // count for band in range(count + 1)]
+    # With the caller's context variables, such as the listener to its steps.
+    contexts = [copy_context() for _ in range(count)]
     with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(work, ends[:-1], ends[1:]))
+        list(pool.map(lambda context, *rows: context.run(work, *rows), contexts, ends[:-1], ends[1:]))

@@ -331,7 +331,7 @@ def test_stdout_is_only_json_that_names_the_files(pictures, capfd):
     assert run("depth left.png right.png --model eight.onnx --calib calib.txt -o out --json") == 0
     printed, told = capfd.readouterr()
     summary = json.loads(printed)
-    assert told == ""
+    assert [line for line in told.splitlines() if not line.endswith(" …")] == []  # only steps
     assert summary["pictures"] == ["left.png", "right.png"]
     assert (summary["model"], summary["width_px"], summary["height_px"]) == ("eight.onnx", 96, 64)
     assert 7 < summary["disparity_min_px"] <= 8 <= summary["disparity_max_px"] < 9
@@ -349,7 +349,7 @@ def test_problems_of_a_pair_are_printed(pictures, capfd, command):
         run(f"{command} black.png black.png --threads 1 -o {'out.png' if command == 'view' else 'out'}") == 0
     )
     printed, told = capfd.readouterr()
-    assert told == ""
+    assert [line for line in told.splitlines() if not line.endswith(" …")] == []  # only steps
     notes = json.loads(printed)["notes"] if "--json" in command else printed.splitlines()
     assert [note for note in notes if note.startswith("only 0 % of the disparities are confident")] != []
 

@@ -15,7 +15,7 @@ from stereoweave.matching.backend import Backend
 from stereoweave.matching.matcher import Matcher
 from stereoweave.matching.providers import PROVIDERS
 from stereoweave.outputs.results import DepthJob, job_facts, make_depth
-from stereoweave.system import jit as compiling
+from stereoweave.system import kernel_cache as compiling
 
 HERE = [name for name, known in PROVIDERS.items() if known.name in onnxruntime.get_available_providers()]
 ABSENT = [name for name in PROVIDERS if name not in HERE]

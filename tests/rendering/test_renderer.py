@@ -283,7 +283,7 @@ import numpy as np
 from stereoweave.rendering import canvas_kernels as kernels
 assert kernels.__file__.startswith({folder!r})
 kernels.splat(np.zeros((2, 3), np.float32), 0.5, 0.0, np.zeros((2, 3), np.float32))
-print(sum(kernels.splat.stats.cache_hits.values()))
+print(kernels.splat.loads)
 """
 
 

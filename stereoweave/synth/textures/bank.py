@@ -29,7 +29,7 @@ from stereoweave.synth.textures import (
     water_and_sky,
 )
 from stereoweave.synth.textures.tiling import SIDE, Colours, Texture
-from stereoweave.system.jit import cache_folder
+from stereoweave.system.kernel_cache import cache_folder
 
 BANK_SEED = 20_241_121
 _KEPT_DAYS = 30

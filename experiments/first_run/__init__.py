@@ -1,0 +1,1 @@
+"""Benchmark of the run times of the paper's network and its rivals."""

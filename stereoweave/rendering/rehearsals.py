@@ -1,0 +1,34 @@
+"""Rehearsals of view synthesis, which compile its kernels (`kernel_cache.compile_ahead`).
+
+There are two, for two processes: `rehearse_drawing` compiles the kernel `draw`, which takes longer to compile
+than all others together.
+"""
+
+import numpy as np
+
+from stereoweave.rendering.renderer import Renderer
+from stereoweave.stereo import Estimate, StereoPair
+
+_SIDE_PX = 32
+
+
+def rehearse_drawing() -> None:
+    """Render a small view from between the cameras."""
+    _renderer().view(0.5)
+
+
+def rehearse_filling() -> None:
+    """Fill the holes of a small canvas, for views from between and beyond the cameras."""
+    from stereoweave.rendering.canvas_kernels import empty_canvas
+    from stereoweave.rendering.hole_filling_kernels import fill, paint_background
+
+    background = _renderer().find_background(right=False)
+    canvas = empty_canvas(background.colours)
+    paint_background(*background, 0.0, 0.0, canvas)
+    fill(canvas)
+
+
+def _renderer() -> Renderer:
+    image, px = np.zeros((_SIDE_PX, _SIDE_PX, 3), np.uint8), np.zeros((_SIDE_PX, _SIDE_PX), np.float32)
+    estimate = Estimate(disparity_px=px, right_disparity_px=px, confidence=px, occluded=px > 0)
+    return Renderer(StereoPair(left=image, right=image), estimate, threads=1)

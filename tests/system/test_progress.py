@@ -1,0 +1,104 @@
+"""Steps of commands as a terminal and a log show them."""
+
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image
+
+pty = pytest.importorskip("pty")  # Windows has none
+
+
+@pytest.fixture
+def pair(rng, tmp_path, monkeypatch):
+    """Write a pair of 95x64 with a disparity of 8 px to the current folder."""
+    monkeypatch.chdir(tmp_path)
+    photograph = Image.fromarray(rng.integers(0, 256, (8, 13, 3), dtype=np.uint8)).resize((104, 64))
+    photograph.crop((0, 0, 95, 64)).save("left.png")
+    photograph.crop((8, 0, 103, 64)).save("right.png")
+
+
+def command(line):
+    return [sys.executable, "-m", "stereoweave", *line.split()]
+
+
+def in_terminal(line):
+    """Run a command with a terminal as stderr. Returns exit code, stdout and what the terminal got."""
+    ours, its = pty.openpty()
+    with subprocess.Popen(
+        command(line), stdout=subprocess.PIPE, stderr=its, env=os.environ | {"TERM": "xterm"}
+    ) as running:
+        os.close(its)
+        got = b""
+        while chunk := read(ours):
+            got += chunk
+        printed = running.stdout.read()
+    os.close(ours)
+    return running.returncode, printed.decode(), got.decode()
+
+
+def read(terminal):
+    """Return what the terminal got since the last call; nothing after the last process has closed it."""
+    try:
+        return os.read(terminal, 4096)
+    except OSError:  # on Linux
+        return b""
+
+
+def test_a_terminal_shows_the_steps_and_in_the_end_none_of_them(pair):
+    code, printed, got = in_terminal("depth left.png right.png --json -o out")
+    assert code == 0
+    assert json.loads(printed)["width_px"] == 95
+    shown = [got.index(step) for step in ("starting …", "matching …", "writing the files …")]
+    assert shown == sorted(shown)
+    # The control sequence that erases a line is the last thing that the terminal got.
+    assert got.endswith("\x1b[2K")
+
+
+def test_an_error_replaces_the_step_in_the_terminal(pair):
+    code, printed, got = in_terminal("depth left.png missing.png -o out")
+    assert (code, printed) == (2, "")
+    assert got.startswith("\x1b[?25lstarting …")
+    assert got.rpartition("\x1b[2K")[2].startswith("stereoweave: missing.png: ")
+
+
+def test_the_bar_of_a_batch_takes_the_place_of_the_steps(pair, tmp_path):
+    folder = tmp_path / "pairs" / "first"
+    folder.mkdir(parents=True)
+    for side in ("left.png", "right.png"):
+        (tmp_path / side).rename(folder / side)
+    code, _, got = in_terminal("depth pairs --jobs 1 -o many")
+    assert code == 0
+    before, _, after = got.partition("1/1")
+    assert "starting …" in before
+    assert "starting …" not in after
+
+
+IN_A_LOG = """
+from stereoweave.system.progress import show_steps
+from stereoweave.system.steps import step
+with show_steps():
+    with step("opening the pictures"):
+        pass
+    with step("matching"):
+        answer = input()
+print(answer)
+"""
+
+
+def test_a_step_that_lasts_is_a_plain_line_in_a_log():
+    pipe = subprocess.PIPE
+    with subprocess.Popen(
+        [sys.executable, "-c", IN_A_LOG], stdin=pipe, stdout=pipe, stderr=pipe, encoding="utf-8"
+    ) as running:
+        assert running.stderr.readline() == "matching …\n"  # the step lasts until it has been read
+        assert running.communicate("done\n") == ("done\n", "")
+
+
+def test_an_error_in_the_input_is_the_only_line_of_a_log(pair):
+    done = subprocess.run(command("depth left.png missing.png -o out"), capture_output=True, text=True)
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("stereoweave: missing.png: ")
