@@ -86,13 +86,16 @@ def shows_steps(command: Callable[Given, None]) -> Callable[Given, None]:
 
 def compile_ahead_for_views(refined: bool, model: str) -> None:
     """Start to compile the kernels that render views and, if needed, those that refine the disparity."""
+    from stereoweave.matching.edge_vote.vote import rehearse_voting
     from stereoweave.matching.matcher import MODES
     from stereoweave.matching.refine import rehearse_refining
     from stereoweave.rendering.rehearsals import rehearse_drawing, rehearse_filling
     from stereoweave.system.kernel_cache import compile_ahead
 
-    refining = [rehearse_refining] if refined or (model in MODES and MODES[model].refined) else []
-    compile_ahead(rehearse_drawing, *refining, rehearse_filling)
+    settles = model in MODES and MODES[model].refined
+    refining = [rehearse_refining] if refined or settles else []
+    voting = [rehearse_voting] if settles else []
+    compile_ahead(rehearse_drawing, *refining, *voting, rehearse_filling)
 
 
 class Command(TyperCommand):

@@ -44,6 +44,13 @@ def vote_at_edges(
     return replace(estimate, disparity_px=_vote(image, estimate.disparity_px, confidence, threads))
 
 
+def rehearse_voting() -> None:
+    """Vote on a small estimate, to compile the kernel (`kernel_cache.compile_ahead`)."""
+    image, px = np.zeros((32, 32, 3), np.uint8), np.zeros((32, 32), np.float32)
+    estimate = Estimate(disparity_px=px, right_disparity_px=px, confidence=px, occluded=px > 0)
+    vote_at_edges(image, estimate, 1)
+
+
 def _vote(
     image: UInt8[np.ndarray, "h w 3"],
     disparity_px: Float32[np.ndarray, "h w"],
