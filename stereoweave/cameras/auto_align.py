@@ -10,6 +10,7 @@ from stereoweave.errors import Note, Remedy, StereoweaveError
 from stereoweave.stereo import StereoPair
 
 _SWAPPED = Note("left and right were swapped, and have been swapped back")
+_NO_BETTER = Note("the pair was not rectified, because its rows would not come closer")
 _KEEP = Remedy("keep the pictures as they are", ("no_rectify",))
 # The disparities of a pair out of line may have any sign. Left and right are swapped if the vote on the depth
 # order is below this.
@@ -35,18 +36,22 @@ class Aligned:
     warps: Warps | None = None
 
 
-def align(pair: StereoPair) -> Aligned:
+def align(pair: StereoPair, *, always: bool = False) -> Aligned:
     """Rectify a pair if its rows are apart, and swap its sides if they are swapped.
 
     A sound pair, or one with too few matches, is returned as it is. A pair whose rows would not come closer
     is not warped.
+
+    Args:
+        pair: The pair.
+        always: Rectify sound pairs too, and raise the errors of `rectify_by_features`.
     """
-    aligned = align_rows(pair)
+    aligned = _rectify(pair) if always else align_rows(pair)
     # Of a rectified pair, the signs of the disparities must agree with the depth order.
     suspicious = aligned.warps is not None or "swapped" in aligned.alignment.defects
     if not suspicious or _find_depth_order(aligned) >= _SWAPPED_VOTE:
         return aligned
-    other = align_rows(swap(pair))
+    other = _rectify(swap(pair)) if always else align_rows(swap(pair))
     return replace(other, swapped=True, notes=(_SWAPPED, *other.notes))
 
 
@@ -57,16 +62,20 @@ def align_rows(pair: StereoPair) -> Aligned:
     if not before.is_known or before.is_rectified:
         return as_it_is
     try:
-        fit = fit_warps(pair)
+        rectified = _rectify(pair)
     except StereoweaveError as error:
         note = Note(f"the pair could not be rectified: {error.message}", error.remedy)
         return replace(as_it_is, notes=(note,))
+    if not (rectified.alignment.vertical_error_95_px < before.vertical_error_95_px):
+        return replace(as_it_is, notes=(_NO_BETTER,))
+    return replace(rectified, notes=tuple(replace(note, remedy=_KEEP) for note in rectified.notes))
+
+
+def _rectify(pair: StereoPair) -> Aligned:
+    fit = fit_warps(pair)
     rectified = apply_warps(pair, fit.warps)
-    after = check_pair(rectified.left, rectified.right)
-    if not (after.vertical_error_95_px < before.vertical_error_95_px):
-        return as_it_is
-    note = replace(fit.note, remedy=_KEEP)
-    return Aligned(pair=rectified, alignment=after, notes=(note,), warps=fit.warps)
+    alignment = check_pair(rectified.left, rectified.right)
+    return Aligned(pair=rectified, alignment=alignment, notes=(fit.note,), warps=fit.warps)
 
 
 def swap(pair: StereoPair) -> StereoPair:
