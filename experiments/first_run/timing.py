@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stereoweave.errors import StereoweaveError
-from stereoweave.system.threads import usable_cores
 
 _ERASE_LINE = b"\x1b[2K"
 COMMANDS = {"depth": ["--out", "depth"], "view": ["--out", "view.png"]}
@@ -29,7 +28,6 @@ class FirstRunRow:
         wall_s: Time until the command ends.
         processor_s: Processor time of the command and of the processes that it starts. Unlike the others, it
             hardly depends on other work on the machine.
-        cores: Number of usable cores.
         turns: Number of runs.
     """
 
@@ -38,7 +36,6 @@ class FirstRunRow:
     first_word_s: float
     wall_s: float
     processor_s: float
-    cores: int
     turns: int
 
 
@@ -65,7 +62,6 @@ def _measure(command: str, arguments: Sequence[str], turns: int) -> list[FirstRu
             first_word_s=min(first_word_s for first_word_s, _, _ in times),
             wall_s=min(wall_s for _, wall_s, _ in times),
             processor_s=min(processor_s for _, _, processor_s in times),
-            cores=usable_cores(),
             turns=turns,
         )
         for run, times in runs.items()

@@ -39,7 +39,7 @@ class PairForm:
         self.rectify = gr.Checkbox(
             value=True,
             label=_LABELS["rectify"],
-            info="Only where needed: pictures taken by hand, or left and right swapped.",
+            info="Only where needed, as in pictures taken by hand; not with focal length and baseline.",
             elem_id="rectify",
         )
         self.model = gr.Radio(
@@ -92,7 +92,7 @@ class PairForm:
         )
         pictures = tuple(Path(file) for file in (given[self.left], given[self.right]) if file)
         backend = Backend(model=given[self.model], provider=provider)
-        return Uploads(pictures=pictures, request=request, backend=backend)
+        return Uploads(pictures=pictures, request=request, backend=backend, name_of=label_of)
 
 
 def make_layout_choice(label: str, names: Iterable[str], elem_id: str) -> gr.Dropdown:

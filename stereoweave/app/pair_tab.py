@@ -40,8 +40,7 @@ from stereoweave.outputs.run import Result
 _EMPTY = """<div class="empty"><ol>
 <li>Drop the left and the right picture, or one file that holds both:
 side by side, one above the other, MPO or JPS.</li>
-<li>Press <b>Find depth</b>. If the pictures come from your hand or from two separate cameras, tick
-<b>Align the pictures</b>.</li>
+<li>Press <b>Find depth</b>. Pictures taken by hand or by two separate cameras are aligned first.</li>
 <li>Move between the cameras, turn the points in 3-D, measure, and download 3-D pictures and files.</li>
 </ol></div>"""
 _ABOUT_FILES = """<p><b>report.html</b> shows the result in any browser; <b>preview.png</b> is the depth in

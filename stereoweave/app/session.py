@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from stereoweave.app.stereo_pictures import StereoPicture, crop_both
-from stereoweave.errors import Note, StereoweaveError
+from stereoweave.errors import NameOf, Note, StereoweaveError, keyword
 from stereoweave.io.colormap import colour_disparity, find_colour_range_px
 from stereoweave.matching.backend import Backend
 from stereoweave.matching.options import MatchOptions
@@ -69,11 +69,12 @@ class Session:
 
 @dataclass(frozen=True, kw_only=True)
 class Uploads:
-    """A visitor's uploaded pictures and settings."""
+    """A visitor's uploaded pictures and settings; `name_of` names settings in the report."""
 
     pictures: tuple[Path, ...]
     request: Request
     backend: Backend
+    name_of: NameOf = keyword
 
 
 def match_uploads(uploads: Uploads, report_progress: Callable[[float, str], None]) -> Result:
@@ -88,7 +89,8 @@ def match_uploads(uploads: Uploads, report_progress: Callable[[float, str], None
     prepared = prepare(uploads.pictures, uploads.request)
     height, width = prepared.pair.left.shape[:2]
     report_progress(0.3, f"matching {width}×{height} px")
-    return run(prepared, uploads.backend.matcher(), MatchOptions(refined=True))
+    result = run(prepared, uploads.backend.matcher(), MatchOptions(refined=True))
+    return replace(result, name_of=uploads.name_of)
 
 
 def check_uploads(files: Iterable[Path | None]) -> None:

@@ -96,8 +96,8 @@ def fit_warps(pair: StereoPair) -> Fit:
     cameras = fit_cameras(_select_inliers(found, scale * _FIRST_PX), (width, height))
     for within_px in _SELECTIONS_PX:
         cameras = _fit_again(cameras, found, scale * within_px)
-    smooth = _bend_rows(_place(cameras, found), found, scale)
-    chosen = smooth or _place(_fit_again(cameras, found, scale * _RIGHT_PX), found)
+    smooth = _bend_rows(_place(cameras, found, scale), found, scale)
+    chosen = smooth or _place(_fit_again(cameras, found, scale * _RIGHT_PX), found, scale)
     missed_px = np.abs(chosen.warps.transform(found).lower_px)
     agreeing = _require_enough(found, missed_px < scale * _RIGHT_PX)
     _check(chosen.cameras, float(np.median(missed_px[missed_px < scale * _SELECTIONS_PX[-1]])), scale)
@@ -138,13 +138,13 @@ def _require_enough(found: Matches, right_ones: Bool[np.ndarray, " n"]) -> Match
     return found.select(right_ones)
 
 
-def _place(cameras: CameraFit, found: Matches) -> _Candidate:
+def _place(cameras: CameraFit, found: Matches, scale: float) -> _Candidate:
     """Return the cameras' warps, moved and scaled so that little of the pictures is lost.
 
     The left picture stays centred. The right one is shifted to the left if disparities would be negative.
     """
     warps = cameras.make_warps()
-    matches = found.select(np.abs(cameras.measure_sampson_px(found)) < _SELECTIONS_PX[-1])
+    matches = _require_enough(found, np.abs(cameras.measure_sampson_px(found)) < scale * _SELECTIONS_PX[-1])
     moved = warps.transform(matches)
     back_x, back_y = np.median(matches.left_px, 0) - np.median(moved.left_px, 0)
     warps = Warps(warps.left.shifted((back_x, back_y)), warps.right.shifted((back_x, back_y)))

@@ -87,6 +87,15 @@ Rate = Annotated[
 ]
 
 
+RectifyShots = Annotated[
+    bool,
+    typer.Option(
+        "--rectify/--no-rectify",
+        help="Rectify the shots whose rows are apart, and swap left and right back if they are swapped.",
+    ),
+]
+
+
 def video(  # noqa: PLR0913 - each is an option of the command line
     videos: Videos,
     out: Out,
@@ -98,6 +107,7 @@ def video(  # noqa: PLR0913 - each is an option of the command line
     convergence: Convergence = None,
     format: Format = None,
     rate: Rate = None,
+    rectify: RectifyShots = True,
     model: Model = "small",
     threads: Threads = None,
     provider: Provider = "cpu",
@@ -124,6 +134,7 @@ def video(  # noqa: PLR0913 - each is an option of the command line
             layout=layout,
             strength=strength,
             convergence_px=convergence,
+            rectify=rectify,
             backend=Backend(model=model, threads=threads, provider=provider),
             name_of=running_options(),
         )

@@ -113,6 +113,7 @@ class ViewFile:
         ends = sorted({min(self._positions), max(self._positions)})
         return find_common_part(renderer, ends, up=self.up, forward=self.forward)
 
+    @step("rendering the view")
     def _write_view(self, renderer: Renderer) -> str:
         part = self._find_part(renderer)
         view = renderer.view(self.position, up=self.up, forward=self.forward)

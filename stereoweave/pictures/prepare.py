@@ -8,7 +8,6 @@ from stereoweave.cameras.alignment import Alignment
 from stereoweave.cameras.auto_align import align
 from stereoweave.cameras.calibration_files import read_rig
 from stereoweave.cameras.rectify import Rectified, rectify
-from stereoweave.cameras.rectify_uncalibrated import rectify_by_features
 from stereoweave.cameras.rig import pair_size_px
 from stereoweave.errors import Note, Remedy, StereoweaveError
 from stereoweave.io.exif import Lens
@@ -135,12 +134,8 @@ def _align(pair: StereoPair, rectified: bool | None) -> _Ready:
     """
     if rectified is False:
         return _Ready(pair)
-    if rectified:
-        always = rectify_by_features(pair)
-        ready = _Ready(always.pair, always.notes)
-    else:
-        aligned = align(pair)
-        ready = _Ready(aligned.pair, aligned.notes, aligned.alignment)
+    aligned = align(pair, always=bool(rectified))
+    ready = _Ready(aligned.pair, aligned.notes, aligned.alignment)
     if pair.camera is None or ready.pair.camera is not None:
         return ready
     lost = Note(

@@ -75,8 +75,10 @@ class ChildProcess:
 
     def kill(self) -> None:
         """Kill the process. A call that is under way replaces it and raises ProcessDiedError."""
-        self._process.kill()
-        self._process.wait()
+        # A call that is under way may replace the process meanwhile.
+        process = self._process
+        process.kill()
+        process.wait()
 
     def close(self) -> None:
         """Stop the child process."""

@@ -13,6 +13,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
+from importlib.metadata import version
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
 
@@ -135,7 +136,7 @@ def _sources_digest() -> str:
 
     Numba checks only a kernel's own file for changes, and would keep stale code for functions in other files.
     """
-    digest = hashlib.sha256(sys.version.encode())
+    digest = hashlib.sha256(f"{sys.version} {version('numba')}".encode())
     for source in (
         Path(__file__).with_name("jit.py"),
         *sorted(Path(__file__).parents[1].rglob("*_kernels.py")),

@@ -3,6 +3,7 @@
 Functions announce their steps by `step` and do not know who shows them. By default, nobody does.
 """
 
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -29,23 +30,30 @@ Listener = Callable[[Step | None], None]
 
 
 class _Announcer:
-    """The steps under way, innermost last, and the function that is told about them."""
+    """The steps under way, innermost last, and the function that is told about them.
+
+    Several threads may announce steps. The listener is called by one of them at a time.
+    """
 
     def __init__(self, listener: Listener) -> None:
         self._listener, self._steps = listener, list[Step]()
+        self._lock = threading.RLock()
 
     def begin(self, step: Step) -> None:
-        self._steps.append(step)
-        self._tell()
+        with self._lock:
+            self._steps.append(step)
+            self._tell()
 
     def advance(self, step: Step, parts: int) -> None:
-        step.done += parts
-        self._tell()
+        with self._lock:
+            step.done += parts
+            self._tell()
 
     def end(self, step: Step) -> None:
-        # Not always the last one: several threads may announce steps.
-        self._steps = [other for other in self._steps if other is not step]
-        self._tell()
+        with self._lock:
+            # Not always the last one, because of other threads.
+            self._steps = [other for other in self._steps if other is not step]
+            self._tell()
 
     def _tell(self) -> None:
         self._listener(self._steps[-1] if self._steps else None)

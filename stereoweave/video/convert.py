@@ -23,6 +23,7 @@ from stereoweave.system.threads import thread_count
 from stereoweave.video.job import VideoJob
 from stereoweave.video.parts import open_parts
 from stereoweave.video.reader import StereoFrame, StereoVideo, format_time
+from stereoweave.video.shot_alignment import ShotAligner
 from stereoweave.video.survey import Survey, survey_video
 from stereoweave.video.temporal_filter import TemporalFilter
 from stereoweave.video.tracks import list_picture_files
@@ -98,7 +99,7 @@ def convert_video(
         if parts.files:
             converter = _FrameConverter.from_state(job, matcher, parts.state())
         else:
-            survey, notes = survey_video(video, matcher, bar)
+            survey, notes = survey_video(video, matcher, bar, rectified=job.rectify)
             converter = _FrameConverter(job, matcher, survey)
             for note in [*notes, *job.find_losses(survey)]:
                 line = note.format(job.name_of)
@@ -121,6 +122,7 @@ class _FrameConverter:
         self.survey, self.tally = survey, VideoTally()
         self._options = MatchOptions(range_px=survey.match_range_px)
         self._job, self._matcher, self._filter = job, matcher, TemporalFilter(job.backend.threads)
+        self._aligner = ShotAligner(swapped=survey.swapped)
 
     @classmethod
     def from_state(cls, job: VideoJob, matcher: Matcher, state: dict[str, np.ndarray]) -> "_FrameConverter":
@@ -129,10 +131,12 @@ class _FrameConverter:
         survey = Survey(
             (low_px, high_px), middle_px, (match_range_px[0], match_range_px[1]) if match_range_px else None
         )
+        aligner = ShotAligner.from_state(state)
         converter = cls(job, matcher, survey)
         frames, cuts, problems = state.pop("tally").tolist()
         converter.tally = VideoTally(frames, cuts, problems, state.pop("named").tolist())
         converter._filter = TemporalFilter.from_state(state, job.backend.threads)
+        converter._aligner = aligner
         return converter
 
     def state(self) -> dict[str, np.ndarray]:
@@ -145,6 +149,7 @@ class _FrameConverter:
             "tally": np.array([tally.frames, tally.cuts, tally.problems]),
             "named": np.array(tally.named, dtype=np.str_),
             **self._filter.state(),
+            **self._aligner.state(),
         }
 
     def convert(
@@ -152,13 +157,23 @@ class _FrameConverter:
     ) -> Iterator[tuple[Fraction, Picture]]:
         """Yield the time in seconds and the output image of each frame, and update the progress bar."""
         for frame in frames:
-            pair = StereoPair(left=frame.left, right=frame.right)
+            pair = self._align(StereoPair(left=frame.left, right=frame.right))
             estimate = match(self._matcher, pair, self._options)
-            estimate = self._filter(frame.left, frame.right, estimate)
+            estimate = self._filter(pair.left, pair.right, estimate)
             self.tally.add(frame)
             self.tally.cuts = self._filter.cuts
             bar.update(shown, completed=self.tally.frames)
             yield frame.time, self._job.render_frame(pair, estimate, self.survey)
+
+    def _align(self, pair: StereoPair) -> StereoPair:
+        """Return the frame, rectified as its shot requires."""
+        if not self._job.rectify:
+            return pair
+        aligned = self._aligner(pair)
+        if not (self.tally.frames and self._filter.begins_shot(aligned.left)):
+            return aligned
+        self._aligner.begin_shot()
+        return self._aligner(pair)
 
 
 def _check_output(out: Path, job: VideoJob, video: StereoVideo, sources: Sequence[Path]) -> None:
@@ -183,6 +198,7 @@ def _list_settings(job: VideoJob, video: StereoVideo, sources: Sequence[Path]) -
         "position": job.position,
         "layout": job.layout,
         "strength": job.strength,
+        "rectify": job.rectify,
         "convergence_px": job.convergence_px,
         "arrangement": video.frame_packing,
         "rate": str(video.rate),

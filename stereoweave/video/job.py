@@ -34,6 +34,7 @@ class VideoJob:
         strength: Factor by which the baseline is multiplied.
         convergence_px: Disparity of the points that stay in the same column in all views. Default: the median
             disparity of the scene for layouts that overlay their views, 0 for all others.
+        rectify: Whether to rectify the shots whose rows are apart, and to swap the sides if they are swapped.
         backend: Backend that matches the frames.
         name_of: Function that returns the front end's name for a setting, used in notes.
     """
@@ -44,6 +45,7 @@ class VideoJob:
     layout: str | None = None
     strength: float = 1.0
     convergence_px: float | None = None
+    rectify: bool = True
     backend: Backend = Backend()
     name_of: NameOf = keyword
 

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from rich.progress import Progress
 
 from stereoweave.cameras.alignment import SWAPPED
+from stereoweave.cameras.auto_align import align
 from stereoweave.cameras.diagnosis import find_problems
 from stereoweave.errors import Note, Remedy
 from stereoweave.io.colormap import find_colour_range_px
@@ -34,34 +35,47 @@ class Survey(NamedTuple):
         range_px: Disparity range that the colours represent.
         middle_px: Median disparity of the scene.
         match_range_px: Disparity range to match; None if the network's own range covers the surveyed frames.
+        swapped: Whether left and right are swapped in most of the surveyed frames.
     """
 
     range_px: tuple[float, float]
     middle_px: float
     match_range_px: tuple[float, float] | None
+    swapped: bool = False
 
 
-def survey_video(video: StereoVideo, matcher: Matcher, bar: Progress) -> tuple[Survey, list[Note]]:
+def survey_video(
+    video: StereoVideo, matcher: Matcher, bar: Progress, *, rectified: bool = True
+) -> tuple[Survey, list[Note]]:
     """Measure the disparities of frames spread over the whole video, and find defects.
 
-    The first frames alone are not enough, because they may be titles with a different disparity range.
+    The first frames alone are not enough, because they may be titles with a different disparity range. If
+    `rectified`, frames out of line are aligned first.
     """
     picked = _spread_evenly(video.frame_count, _SURVEYED_FRAMES)
     checked = set(picked[len(picked) // 6 :: -(-len(picked) // _CHECKED_FRAMES)])
     shown = bar.add_task("surveying depth", total=len(picked), loss="", rate="")
-    thinned, middles_px, defects = [], [], []
+    thinned, middles_px, defects, swapped = [], [], [], []
     frames = islice(video.frames(), picked.start, picked.stop, picked.step)
     for index, frame in zip(picked, frames, strict=True):
         pair = StereoPair(left=frame.left, right=frame.right)
+        aligned = align(pair) if rectified else None
+        pair = aligned.pair if aligned else pair
+        swapped.append(aligned is not None and aligned.swapped)
         estimate = match(matcher, pair)
         thinned.append(estimate.disparity_px[::_SURVEY_STEP_PX, ::_SURVEY_STEP_PX])
         middles_px.append(median_disparity_px(estimate))
         if index in checked:
-            defects.append([_add_time(frame.time, note, video) for note in find_problems(pair, estimate)])
+            problems = find_problems(pair, estimate, aligned.alignment if aligned else None)
+            notes = [*(aligned.notes if aligned else ()), *problems]
+            defects.append([_add_time(frame.time, note, video) for note in notes])
         bar.advance(shown)
     all_px = np.vstack(thinned)
     survey = Survey(
-        find_colour_range_px(all_px), float(np.median(middles_px)), _find_match_range_px(all_px, matcher)
+        find_colour_range_px(all_px),
+        float(np.median(middles_px)),
+        _find_match_range_px(all_px, matcher),
+        2 * sum(swapped) > len(swapped),
     )
     return survey, _select_common_notes(defects)
 

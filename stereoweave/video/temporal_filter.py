@@ -161,6 +161,13 @@ class TemporalFilter:
             occluded=estimate.occluded,
         )
 
+    def begins_shot(self, left: UInt8[np.ndarray, "h w 3"]) -> bool:
+        """Return whether the left image of the next frame begins a shot."""
+        grey = _convert_to_grey(left)
+        if not self._greys or self._greys[0].shape != grey.shape:
+            return True
+        return _measure_motion(self._greys[0], grey).explained_share < _CUT_SHARE
+
     def state(self) -> dict[str, np.ndarray]:
         """Return the complete state as arrays for `np.savez`; a restored filter gives the same results."""
         kept = {"cuts": np.array(self.cuts)}

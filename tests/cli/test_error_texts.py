@@ -157,10 +157,12 @@ def test_many_pairs_have_the_same_texts(capsys):
     assert NOTES["view upper.png lower.png --model small --no-rectify -o out.png"] in low
 
 
-def test_notes_on_a_video_do_not_advise_rectification(capsys):
-    assert main(["video", "upper.png", "lower.png", "--depth", "-o", "out.mkv", "--threads", "1"]) == 0
+def test_notes_on_a_video_name_its_option(capsys):
+    words = ["video", "upper.png", "lower.png", "--depth", "-o", "out.mkv", "--threads", "1"]
+    assert main([*words, "--no-rectify"]) == 0
     (line,) = [line for line in capsys.readouterr().err.splitlines() if "px lower" in line]
-    assert line == "0:00:00.000 the right picture is 2.0 px lower than the left one"
+    expected = "the right picture is 2.0 px lower than the left one; rectify the pair (--rectify)"
+    assert line == f"0:00:00.000 {expected}"
 
 
 def test_a_folder_whose_pictures_name_no_side_says_what_they_are_taken_for(capsys):

@@ -18,6 +18,7 @@ from video_examples import TEXTURED, damage, example_pairs, packets, write_side_
 from stereoweave.cli.root import main
 from stereoweave.io.colormap import colour_disparity
 from stereoweave.io.images import read_image, write_image
+from stereoweave.learn.data.collage import paint_collage
 from stereoweave.matching.matcher import Matcher
 from stereoweave.rendering.layouts import LAYOUTS, LayoutOptions
 from stereoweave.rendering.renderer import Renderer
@@ -340,7 +341,7 @@ def test_a_file_that_is_not_a_3d_video_is_refused_in_one_line(tmp_path, capsys):
 def test_swapped_views_are_noted_with_the_frame_packing_that_corrects_them(tmp_path, capsys):
     pairs = example_pairs(2, width=320, height=192)
     crossed = write_side_by_side(tmp_path / "in.mp4", pairs, layout="crossed", codec="libx264")
-    assert run(crossed, tmp_path / "a.mp4", "--depth", "--format", "side_by_side") == 0
+    assert run(crossed, tmp_path / "a.mp4", "--depth", "--format", "side_by_side", "--no-rectify") == 0
     told = capsys.readouterr().err
     assert told.count("swapped; choose crossed (--format)") == 1
     assert run(crossed, tmp_path / "b.mp4", "--depth", "--format", "crossed") == 0
@@ -353,7 +354,8 @@ def test_defects_are_found_beyond_the_first_minute(tmp_path, capsys):
     pairs = [pair if index < 3 else pair[::-1] for index, pair in enumerate(pairs)]
     times_ms = range(0, 8 * 10_000, 10_000)
     video = write_side_by_side(tmp_path / "in.mp4", pairs, times_ms=times_ms, codec="libx264")
-    assert run(video, tmp_path / "out.mp4", "--position", "0", "--format", "side_by_side") == 0
+    words = ["--position", "0", "--format", "side_by_side", "--no-rectify"]
+    assert run(video, tmp_path / "out.mp4", *words) == 0
     assert capsys.readouterr().err.count("0:01:10.000 ") == 1
 
 
@@ -361,10 +363,35 @@ def test_swapped_videos_are_noted_without_a_frame_packing(tmp_path, capsys):
     pairs = example_pairs(2, width=320, height=192)
     left, right = (write_video(tmp_path / f"{eye}.mp4", [pair[eye] for pair in pairs]) for eye in (0, 1))
     words = ["video", str(right), str(left), "-o", str(tmp_path / "out.mp4"), "--position", "0"]
-    assert main(words) == 0
+    assert main([*words, "--no-rectify"]) == 0
     told = capsys.readouterr().err
     assert "swapped" in told
     assert "--format" not in told
+
+
+def test_shots_out_of_line_are_rectified_and_swapped_videos_swapped_back(tmp_path, capsys):
+    """The right views of the second shot are 5 px lower; the result must be that of the sound video."""
+    first, second = (
+        [(cut(pair.left), cut(pair.right))] * 3
+        for pair in (paint_collage(77, 0, index, 240, 320) for index in (2, 6))
+    )
+    lowered = [(left, np.roll(right, 5, axis=0)) for left, right in second]
+    sound = write_side_by_side(tmp_path / "sound.mkv", first + second, codec="libx264")
+    odd = [(right, left) for left, right in first + lowered]
+    mixed = write_side_by_side(tmp_path / "mixed.mkv", odd, codec="libx264")
+    for video in (sound, mixed):
+        out = tmp_path / f"{video.stem}_depth.mkv"
+        assert run(video, out, "--depth16", "--format", "side_by_side") == 0
+    told = capsys.readouterr().err
+    assert "left and right were swapped" in told
+    expected, found = (frames_of(tmp_path / f"{name}_depth.mkv") for name in ("sound", "mixed"))
+    for index in (0, 5):
+        off_px = (found[index].astype(float) - expected[index])[20:-20, 20:-20] / 256
+        assert np.median(np.abs(off_px - np.median(off_px))) < 0.5
+
+
+def cut(image):
+    return np.ascontiguousarray(image[:192])
 
 
 def write_pictures(folder: Path, count: int) -> Path:
