@@ -45,24 +45,30 @@ def run(commands: Commands, program: str, arguments: Sequence[str] | None) -> in
     try:
         return commands(arguments, prog_name=program, standalone_mode=False) or 0
     except typer.TyperException as error:
-        message = _describe_misuse(error, program, arguments)
+        words = sys.argv[1:] if arguments is None else arguments
+        # A program of one command has no name of a command before its arguments.
+        command = words[0] if words and len(commands.registered_commands) > 1 else None
+        message = _describe_misuse(error, program, command)
     except (StereoweaveError, OSError) as error:
         message = str(error)
     typer.echo(f"{program}: " + " ".join(message.splitlines()), err=True)
     return 2
 
 
-def _describe_misuse(error: typer.TyperException, program: str, arguments: Sequence[str] | None) -> str:
-    """Return an error of the command line's own grammar, with the help to read."""
-    words, context = sys.argv[1:] if arguments is None else arguments, getattr(error, "ctx", None)
+def _describe_misuse(error: typer.TyperException, program: str, command: str | None) -> str:
+    """Return an error of the command line's own grammar, with the help to read.
+
+    `command` is the word in the place of a command, if any.
+    """
+    context = getattr(error, "ctx", None)
     # The context's own name of the program is that of the file that runs.
     names = [program]
     while context is not None and context.parent is not None:
         names.insert(1, str(context.info_name))
         context = context.parent
     message = _UNPARSED.sub("", error.format_message().rstrip(".")).replace("Input should be", "expected")
-    if len(names) == 1 and words and Path(words[0]).exists():
-        message = f"expected a command, such as depth or view, before the pictures, found {words[0]}"
+    if len(names) == 1 and command and Path(command).exists():
+        message = f"expected a command, such as depth or view, before the pictures, found {command}"
     return f"{message}; see {' '.join(names)} --help"
 
 

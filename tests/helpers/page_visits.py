@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
-from playwright.sync_api import Browser, Download
+from playwright.sync_api import Browser, Download, expect
 
 WINDOW = {"width": 1280, "height": 1000}
 # Without compiled kernels in the cache, they are compiled first.
@@ -39,8 +39,10 @@ class Visit:
 
     def take_back(self) -> None:
         """Clear the fields for pictures."""
-        for _ in range(self.page.get_by_label("Clear").count()):
-            self.page.get_by_label("Clear").first.click()
+        clear = self.page.get_by_label("Clear")
+        while before := clear.count():
+            clear.first.click()
+            expect(clear).not_to_have_count(before)
 
     def find(self) -> str:
         """Find depth, wait until the notice has changed and all files exist, and return the notice."""
