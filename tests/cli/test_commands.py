@@ -40,7 +40,7 @@ COMMANDS = dict(find_commands(typer.main.get_command(app)))
         ("synth make", "views", "--view"),
         ("check", "rectify", None),
         ("rectify", "rectify", None),
-        ("video", "rectify", None),
+        ("video", "rectify", "--rectify"),
         ("video", "convergence_px", "--convergence"),
         ("view", "out", "--out"),
         ("app", "open_browser", "--open"),
