@@ -85,6 +85,10 @@ Out = Annotated[
     ),
 ]
 FocalError = Annotated[float, typer.Option(min=0, help="Uncertainty of the focal length, in percent.")]
+RectifyFirst = Annotated[
+    bool,
+    typer.Option("--rectify", help="Rectify the pair first, by its calibration or by matched features."),
+]
 BaselineError = Annotated[float, typer.Option(min=0, help="Uncertainty of the baseline, in percent.")]
 
 
@@ -164,7 +168,7 @@ def measure(  # noqa: PLR0913 - each is an option of the command line
     baseline_m: BaselineM = None,
     focal_error_percent: FocalError = 0.0,
     baseline_error_percent: BaselineError = 0.0,
-    rectify: Rectify = False,
+    rectify: RectifyFirst = False,
     range_px: Range = None,
     refined: Refined = False,
     model: Model = "base",

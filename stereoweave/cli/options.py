@@ -54,7 +54,8 @@ Rectify = Annotated[
     typer.Option(
         "--rectify/--no-rectify",
         help="Rectify the pair by its calibration or, without one, by matched features (default: by matched "
-        "features, if there is no calibration and corresponding points lie in different rows).",
+        "features, if corresponding points lie in different rows and neither a calibration nor focal length "
+        "or baseline is given).",
     ),
 ]
 Range = Annotated[

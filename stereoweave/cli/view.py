@@ -134,8 +134,7 @@ def view(  # noqa: PLR0913 - each is an option of the command line
     out = out or _name_view(pictures, layout)
     name = choose_layout(out, layout)
     _check_unused(name, {"--position": position, "--up": up or None, "--forward": forward or None}, quilt)
-    if strength != 1 or convergence is not None:
-        _check_has_views(name)
+    _check_has_views(name, strength, convergence)
     file = ViewFile(
         path=out,
         name=name,
@@ -182,9 +181,9 @@ def _check_unused(name: str | None, single_view: dict[str, float | None], quilt:
         )
 
 
-def _check_has_views(name: str | None) -> None:
+def _check_has_views(name: str | None, strength: float, convergence: str | None) -> None:
     """Raise a StereoweaveError if the layout has no views that strength and convergence could shift."""
-    if name == "rgbd":
+    if name == "rgbd" and (strength != 1 or convergence is not None):
         raise StereoweaveError(
             "--strength, --convergence: expected only with a layout of several views, found with rgbd"
         )
