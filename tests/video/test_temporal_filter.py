@@ -8,6 +8,7 @@ import pytest
 
 from stereoweave.errors import StereoweaveError
 from stereoweave.stereo import Estimate
+from stereoweave.video.motion import Motion
 from stereoweave.video.temporal_filter import (
     MOST_FRAMES,
     NEIGHBOUR_PX,
@@ -15,7 +16,6 @@ from stereoweave.video.temporal_filter import (
     SAME_SHARE,
     STEP_PX,
     STEPS,
-    Motion,
     TemporalFilter,
     Track,
     blend,

@@ -1,0 +1,122 @@
+"""Motion from one frame of a video to another, and how much of the frame it explains."""
+
+import typing
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+# In pixels at half size, where noise is half as strong and optical flow takes a quarter of the time.
+_WINDOW_PX = 5
+# A window is explained if its mean difference is at most this multiple of the median difference, which
+# measures the image noise, plus an offset for clean images. The third number is the highest noise assumed.
+_EXPLAINED, _LEAST_LEVELS, _NOISIEST_LEVELS = 1.5, 0.5, 6.0
+# Motion always explains a little more than rest, because it also fits the noise.
+_REST, _REST_LEVELS = 1.1, 0.25
+# A pixel is calm if nothing moves in the window of this size around it.
+_CALM_PX = 9
+# This filter is zero on a plane. Gaussian noise with a standard deviation of one level gives a standard
+# deviation of 6 levels, and a median absolute value of 0.674 * 6 levels.
+_ROUGHNESS = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
+_MEDIAN_ROUGHNESS = 6 * 0.674
+# A window has contrast if its standard deviation exceeds this multiple of the noise level plus an offset.
+_CONTRAST, _CONTRAST_LEVELS = 2.0, 1.0
+# A window that differs by more than this share of its contrast shows something else, however faint.
+_DIFFERENT_SHARE = 0.6
+# Contrast in less than this share of an image may be a single object that appears without a cut.
+_LEAST_CONTRAST_SHARE = 0.05
+
+
+class Motion(typing.NamedTuple):
+    """Motion from an image back to the previous image; arrays have half the image size, rounded up.
+
+    Attributes:
+        to_before_px: float32 [H2, W2, 2], offset from a pixel to its position in the previous image, in
+            full-size pixels.
+        explained: bool, true where the previous image looks the same at that position.
+        calm: bool, true where nothing moves nearby.
+        explained_share: Share of the windows with contrast that are explained; 1 if almost no window has
+            contrast.
+    """
+
+    to_before_px: np.ndarray
+    explained: np.ndarray
+    calm: np.ndarray
+    explained_share: float
+
+
+def convert_to_grey(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2"]:
+    """Convert an image to grey at half the size, rounded up."""
+    height, width = image.shape[:2]
+    half = ((width + 1) // 2, (height + 1) // 2)
+    return cv2.resize(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), half, interpolation=cv2.INTER_AREA)
+
+
+def measure_motion(before: UInt8[np.ndarray, "h2 w2"], grey: UInt8[np.ndarray, "h2 w2"]) -> Motion:
+    """Measure the motion from a grey image back to the previous image, both at half size."""
+    before = _match_brightness(before, grey)
+    rest = np.zeros((*grey.shape, 2), np.float32)
+    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST).calc(grey, before, rest)
+    moved_levels = _measure_difference_levels(grey, _warp(before, flow))
+    rest_levels = _measure_difference_levels(grey, before)
+    least_levels = np.minimum(moved_levels, rest_levels)
+    median_levels = min(float(np.median(least_levels[::4, ::4])), _NOISIEST_LEVELS)
+    explained = least_levels <= _EXPLAINED * median_levels + _LEAST_LEVELS
+    rests = rest_levels <= _REST * moved_levels + _REST_LEVELS
+    flow[rests] = 0
+    around = np.ones((_CALM_PX, _CALM_PX), np.uint8)
+    calm = cv2.erode((rests & explained).astype(np.uint8), around).astype(bool)
+    return Motion(2 * flow, explained, calm, _measure_explained_share(grey, least_levels, explained))
+
+
+def _measure_explained_share(
+    grey: UInt8[np.ndarray, "h2 w2"],
+    least_levels: Float[np.ndarray, "h2 w2"],
+    explained: Bool[np.ndarray, "h2 w2"],
+) -> float:
+    """Return the share of windows with contrast that are explained; 1 if almost no window has contrast."""
+    window = (_WINDOW_PX, _WINDOW_PX)
+    squares = cv2.sqrBoxFilter(grey, cv2.CV_32F, window)
+    variance = squares - cv2.boxFilter(grey, cv2.CV_32F, window) ** 2
+    contrast_levels = np.sqrt(np.maximum(variance, 0))
+    has_contrast = contrast_levels > _CONTRAST * _estimate_noise_levels(grey) + _CONTRAST_LEVELS
+    if has_contrast.mean() < _LEAST_CONTRAST_SHARE:
+        return 1.0
+    alike = explained & (least_levels < _DIFFERENT_SHARE * contrast_levels)
+    return float(alike[has_contrast].mean())
+
+
+def _estimate_noise_levels(grey: UInt8[np.ndarray, "h2 w2"]) -> float:
+    """Return the standard deviation of the noise in grey levels, estimated from the median roughness."""
+    roughness = cv2.filter2D(grey, cv2.CV_32F, _ROUGHNESS)
+    return float(np.median(np.abs(roughness[::4, ::4]))) / _MEDIAN_ROUGHNESS
+
+
+def _match_brightness(
+    before: UInt8[np.ndarray, "h2 w2"], grey: UInt8[np.ndarray, "h2 w2"]
+) -> UInt8[np.ndarray, "h2 w2"]:
+    """Return the previous image with the mean and contrast of the new image.
+
+    Otherwise, a fade would count as a change of the scene.
+    """
+    (old_mean, old_contrast), (mean, contrast) = (
+        [float(value[0, 0]) for value in cv2.meanStdDev(picture)] for picture in (before, grey)
+    )
+    gain = contrast / max(old_contrast, 1.0)
+    return cv2.addWeighted(before, gain, before, 0, mean - gain * old_mean)
+
+
+def _warp(
+    before: UInt8[np.ndarray, "h2 w2"], flow: Float[np.ndarray, "h2 w2 2"]
+) -> UInt8[np.ndarray, "h2 w2"]:
+    height, width = before.shape
+    rows, columns = np.indices((height, width), np.float32)
+    source = flow[..., 0] + columns, flow[..., 1] + rows
+    return cv2.remap(before, *source, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+def _measure_difference_levels(
+    a: UInt8[np.ndarray, "h2 w2"], b: UInt8[np.ndarray, "h2 w2"]
+) -> Float[np.ndarray, "h2 w2"]:
+    """Return the mean absolute difference of two images in a window around each pixel, in grey levels."""
+    return cv2.boxFilter(cv2.absdiff(a, b), cv2.CV_32F, (_WINDOW_PX, _WINDOW_PX))
