@@ -18,7 +18,7 @@ from stereoweave.rendering.layouts import LayoutOptions, add_mark
 from stereoweave.stereo import StereoPair
 
 if TYPE_CHECKING:
-    from stereoweave.video.convert import VideoTally
+    from stereoweave.video.frame_converter import VideoTally
     from stereoweave.video.reader import StereoVideo
 
 PREVIEW_S = 5

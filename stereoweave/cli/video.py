@@ -19,7 +19,7 @@ from stereoweave.cli.options import (
 from stereoweave.errors import StereoweaveError
 
 if TYPE_CHECKING:
-    from stereoweave.video.convert import VideoTally
+    from stereoweave.video.frame_converter import VideoTally
 
 _HIGHEST_RATE = 1000
 

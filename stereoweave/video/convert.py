@@ -1,37 +1,31 @@
 """Conversion of a stereo video: matching, temporal filtering, and rendering of depth, a view or a layout."""
 
 import hashlib
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+import time
+from collections.abc import Sequence
+from dataclasses import replace
 from fractions import Fraction
 from itertools import chain, islice
 from pathlib import Path
 
-import numpy as np
 from rich.console import Console
-from rich.progress import Progress, TaskID
+from rich.progress import Progress
 
 from stereoweave import __version__
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.output_lock import lock_output
-from stereoweave.matching.estimate import match
-from stereoweave.matching.matcher import Matcher
-from stereoweave.matching.options import MatchOptions
-from stereoweave.stereo import StereoPair
 from stereoweave.system.progress import progress
 from stereoweave.system.threads import thread_count
+from stereoweave.video.frame_converter import FrameConverter, VideoTally
 from stereoweave.video.job import VideoJob
 from stereoweave.video.parts import open_parts
-from stereoweave.video.reader import StereoFrame, StereoVideo, format_time
-from stereoweave.video.shot_alignment import ShotAligner
-from stereoweave.video.survey import Survey, survey_video
-from stereoweave.video.temporal_filter import TemporalFilter
+from stereoweave.video.reader import StereoVideo, format_time
+from stereoweave.video.survey import survey_video
 from stereoweave.video.tracks import list_picture_files
 from stereoweave.video.writer import GREY16, H264, Packing, Picture, Recorder, check_container
 
 # Length of a part, which begins with a key frame. An interrupted run loses only the unfinished part.
 _PART_S = 10
-_NAMED_PROBLEMS = 3
 
 PACKINGS = {
     "side_by_side": Packing("left_right", 3),
@@ -40,24 +34,6 @@ PACKINGS = {
     "top_bottom": Packing("top_bottom", 4),
     "top_bottom_half": Packing("top_bottom", 4),
 }
-
-
-@dataclass
-class VideoTally:
-    """Counts of frames, cuts and frames with problems so far, and descriptions of the first problems."""
-
-    frames: int = 0
-    cuts: int = 0
-    problems: int = 0
-    named: list[str] = field(default_factory=list)
-
-    def add(self, frame: StereoFrame) -> None:
-        """Count a frame and its problem, if it has one."""
-        self.frames += 1
-        if frame.problem is not None:
-            self.problems += 1
-            if len(self.named) < _NAMED_PROBLEMS:
-                self.named.append(f"{format_time(frame.time)} {frame.problem}")
 
 
 def convert_video(
@@ -82,7 +58,6 @@ def convert_video(
             because the disk is full.
     """
     _check_output(out, job, video, sources)
-    matcher = job.backend.matcher()
     recorder = Recorder(
         encoding=GREY16 if job.depth16 else H264,
         time_base=video.time_base,
@@ -97,83 +72,45 @@ def convert_video(
         progress(console) as bar,
     ):
         if parts.files:
-            converter = _FrameConverter.from_state(job, matcher, parts.state())
+            converter = FrameConverter.from_state(job, parts.state())
+            done_s = converter.tally.frames / video.rate
+            _print_line(console, f"{out.name}: resuming at {format_time(Fraction(round(done_s)))[:-4]}")
         else:
-            survey, notes = survey_video(video, matcher, bar, rectified=job.rectify)
-            converter = _FrameConverter(job, matcher, survey)
+            survey, notes = survey_video(video, job.backend.matcher(), bar, rectified=job.rectify)
+            converter = FrameConverter(job, survey)
             for note in [*notes, *job.find_losses(survey)]:
-                line = note.format(job.name_of)
-                console.print(line, markup=False, highlight=False, soft_wrap=True)
-        done, total = converter.tally.frames, video.frame_count
-        shown = bar.add_task(out.name, total=total, completed=done, loss="", rate="")
-        frames = video.frames(done)
+                _print_line(console, note.format(job.name_of))
+        meter = _Meter(bar, out.name, video, converter.tally.frames)
+        frames = video.frames(converter.tally.frames)
         for first in frames:
             part = islice(chain([first], frames), round(_PART_S * video.rate) or 1)
             with parts.next(converter.state) as path:
-                recorder.write_part(path, converter.convert(part, bar, shown))
+                recorder.write_part(path, map(meter.count, converter.convert(part)))
         recorder.join(parts.files, video.sound, out, job.describe_values(converter.survey))
-    return converter.tally
+    return replace(converter.tally, frames_per_s=meter.frames_per_s)
 
 
-class _FrameConverter:
-    """Converter from frames to output images, whose state can be saved and restored."""
+class _Meter:
+    """Progress bar with the number of frames per second."""
 
-    def __init__(self, job: VideoJob, matcher: Matcher, survey: Survey) -> None:
-        self.survey, self.tally = survey, VideoTally()
-        self._options = MatchOptions(range_px=survey.match_range_px)
-        self._job, self._matcher, self._filter = job, matcher, TemporalFilter(job.backend.threads)
-        self._aligner = ShotAligner(swapped=survey.swapped)
+    def __init__(self, bar: Progress, name: str, video: StereoVideo, done: int) -> None:
+        self._bar, self._count, self._start_s = bar, 0, time.monotonic()
+        self._task = bar.add_task(name, total=video.frame_count, completed=done, loss="", rate="")
 
-    @classmethod
-    def from_state(cls, job: VideoJob, matcher: Matcher, state: dict[str, np.ndarray]) -> "_FrameConverter":
-        """Restore a converter from a saved `state`; its output is the same as without an interruption."""
-        low_px, high_px, middle_px, *match_range_px = state.pop("survey_px").tolist()
-        survey = Survey(
-            (low_px, high_px), middle_px, (match_range_px[0], match_range_px[1]) if match_range_px else None
-        )
-        aligner = ShotAligner.from_state(state)
-        converter = cls(job, matcher, survey)
-        frames, cuts, problems = state.pop("tally").tolist()
-        converter.tally = VideoTally(frames, cuts, problems, state.pop("named").tolist())
-        converter._filter = TemporalFilter.from_state(state, job.backend.threads)
-        converter._aligner = aligner
-        return converter
+    def count(self, picture: tuple[Fraction, Picture]) -> tuple[Fraction, Picture]:
+        """Count a finished picture and return it."""
+        self._count += 1
+        self._bar.update(self._task, advance=1, rate=f"{self.frames_per_s:.1f} frames/s")
+        return picture
 
-    def state(self) -> dict[str, np.ndarray]:
-        """Return everything that affects the output of later frames, as arrays by name."""
-        tally = self.tally
-        return {
-            "survey_px": np.array(
-                [*self.survey.range_px, self.survey.middle_px, *(self.survey.match_range_px or ())]
-            ),
-            "tally": np.array([tally.frames, tally.cuts, tally.problems]),
-            "named": np.array(tally.named, dtype=np.str_),
-            **self._filter.state(),
-            **self._aligner.state(),
-        }
+    @property
+    def frames_per_s(self) -> float:
+        """Frames per second since the start."""
+        return self._count / max(time.monotonic() - self._start_s, 1e-9)
 
-    def convert(
-        self, frames: Iterable[StereoFrame], bar: Progress, shown: TaskID
-    ) -> Iterator[tuple[Fraction, Picture]]:
-        """Yield the time in seconds and the output image of each frame, and update the progress bar."""
-        for frame in frames:
-            pair = self._align(StereoPair(left=frame.left, right=frame.right))
-            estimate = match(self._matcher, pair, self._options)
-            estimate = self._filter(pair.left, pair.right, estimate)
-            self.tally.add(frame)
-            self.tally.cuts = self._filter.cuts
-            bar.update(shown, completed=self.tally.frames)
-            yield frame.time, self._job.render_frame(pair, estimate, self.survey)
 
-    def _align(self, pair: StereoPair) -> StereoPair:
-        """Return the frame, rectified as its shot requires."""
-        if not self._job.rectify:
-            return pair
-        aligned = self._aligner(pair)
-        if not (self.tally.frames and self._filter.begins_shot(aligned.left)):
-            return aligned
-        self._aligner.begin_shot()
-        return self._aligner(pair)
+def _print_line(console: Console, line: str) -> None:
+    console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
 def _check_output(out: Path, job: VideoJob, video: StereoVideo, sources: Sequence[Path]) -> None:
@@ -202,6 +139,7 @@ def _list_settings(job: VideoJob, video: StereoVideo, sources: Sequence[Path]) -
         "convergence_px": job.convergence_px,
         "arrangement": video.frame_packing,
         "rate": str(video.rate),
+        "preview": video.excerpted,
         "model": _identify_source(model) if model.exists() else str(job.backend.model),
         "film": [_identify_source(source) for source in sources],
         "stereoweave": __version__,

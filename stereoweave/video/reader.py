@@ -50,6 +50,8 @@ class StereoVideo:
         rate: Average frames per second.
         time_base: Time unit in seconds; every frame time is a multiple of this unit.
         sound: File that contains the sound; None for a silent video.
+        excerpted: Name of the part of a longer video that this is, such as "1440+120" for 120 frames from
+            frame 1440 on; None for a whole video.
         on_frame: Function that `frames` calls with the number of each frame that it yields, to show progress.
     """
 
@@ -65,6 +67,7 @@ class StereoVideo:
         self.rate, self.time_base = first.rate, first.time_base
         self.sound = next((track.sound for track in tracks if track.sound), None)
         self.on_frame: Callable[[int], None] = lambda number: None
+        self.excerpted: str | None = None
         self._first, self._last = 0, self.frame_count - 1
 
     def excerpt(self, start_s: float, length_s: float) -> "StereoVideo":
@@ -82,6 +85,7 @@ class StereoVideo:
         part = copy.copy(self)
         part._first = self._first + first
         part.frame_count = min(math.ceil(length_s * self.rate), self.frame_count - first)
+        part.excerpted = f"{part._first}+{part.frame_count}"
         part.sound = None
         return part
 

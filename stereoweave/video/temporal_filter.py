@@ -21,7 +21,7 @@ from stereoweave.errors import StereoweaveError
 from stereoweave.stereo import Estimate
 from stereoweave.system.jit import kernel
 from stereoweave.system.threads import thread_count
-from stereoweave.video.motion import Motion, convert_to_grey, measure_motion
+from stereoweave.video.motion import CUT_SHARE, Motion, convert_to_grey, halve, measure_motion
 
 MOST_FRAMES = 12.0
 """Maximum number of frames in a mean. The limit lets the mean follow slow changes."""
@@ -32,9 +32,6 @@ NEIGHBOUR_PX = 3.0
 STEP_PX, STEPS = 8, 2
 """Spacing of the grid of sampled neighbours, and the number of steps in each direction."""
 
-# In rendered videos, the previous frame explains over 0.4 of the windows with contrast, but less than 0.1 of
-# them across a cut.
-_CUT_SHARE = 0.2
 # If at least this share of the image is at rest, a majority of contradictions cannot be due to chance.
 _LEAST_ASKED_SHARE = 0.25
 
@@ -52,6 +49,15 @@ class Track(typing.NamedTuple):
     disparity_px: np.ndarray
     confidence: np.ndarray
     frames: np.ndarray
+
+
+class FilteredFrame(typing.NamedTuple):
+    """A frame of a video: both views as grey images, uint8 [H, W], and their filtered state."""
+
+    left_grey: np.ndarray
+    right_grey: np.ndarray
+    left: Track
+    right: Track
 
 
 class Expectation(typing.NamedTuple):
@@ -125,12 +131,13 @@ class TemporalFilter:
             occluded=estimate.occluded,
         )
 
-    def begins_shot(self, left: UInt8[np.ndarray, "h w 3"]) -> bool:
-        """Return whether the left image of the next frame begins a shot."""
-        grey = convert_to_grey(left)
-        if not self._greys or self._greys[0].shape != grey.shape:
-            return True
-        return measure_motion(self._greys[0], grey).explained_share < _CUT_SHARE
+    @property
+    def last(self) -> FilteredFrame | None:
+        """The last frame, filtered; None before the first one."""
+        if not self._greys:
+            return None
+        (left_grey, right_grey), (left, right) = self._greys, self._tracks
+        return FilteredFrame(left_grey, right_grey, left, right)
 
     def state(self) -> dict[str, np.ndarray]:
         """Return the complete state as arrays for `np.savez`; a restored filter gives the same results."""
@@ -155,8 +162,8 @@ class TemporalFilter:
         if new_tracks[0].frames.shape != self._tracks[0].frames.shape:
             return None
         with ThreadPoolExecutor(self._threads) as pool:
-            motions = list(pool.map(measure_motion, before, self._greys))
-            if np.mean([motion.explained_share for motion in motions]) < _CUT_SHARE:
+            motions = list(pool.map(measure_motion, map(halve, before), map(halve, self._greys)))
+            if np.mean([motion.explained_share for motion in motions]) < CUT_SHARE:
                 return None
             # The match of a pixel is further left in the right view, and further right in the left view.
             expected = list(pool.map(_predict, self._tracks, new_tracks, motions, motions[::-1], (-1, 1)))

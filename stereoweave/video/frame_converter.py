@@ -1,0 +1,136 @@
+"""Conversion of frames to output images, whose steps overlap in threads."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from fractions import Fraction
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+
+from stereoweave.matching.estimate import match
+from stereoweave.matching.options import MatchOptions
+from stereoweave.stereo import Estimate, StereoPair
+from stereoweave.system.ahead import ahead
+from stereoweave.system.threads import thread_count
+from stereoweave.video.carried_frames import carry_between
+from stereoweave.video.frame_groups import FrameGroup, FrameGrouper
+from stereoweave.video.job import VideoJob
+from stereoweave.video.reader import StereoFrame, format_time
+from stereoweave.video.shot_alignment import ShotAligner
+from stereoweave.video.survey import Survey
+from stereoweave.video.temporal_filter import TemporalFilter
+from stereoweave.video.writer import Picture
+
+_NAMED_PROBLEMS = 3
+# Steps that wait for each other need no more than this.
+_FRAMES_AHEAD, _GROUPS_AHEAD = 6, 1
+
+Item = TypeVar("Item")
+
+
+@dataclass
+class VideoTally:
+    """Counts of frames, cuts and frames with problems so far, and descriptions of the first problems.
+
+    `frames_per_s` is the speed of the conversion since it was last started; 0 while it runs.
+    """
+
+    frames: int = 0
+    cuts: int = 0
+    problems: int = 0
+    named: list[str] = field(default_factory=list)
+    frames_per_s: float = 0.0
+
+    def add(self, frame: StereoFrame) -> None:
+        """Count a frame and its problem, if it has one."""
+        self.frames += 1
+        if frame.problem is not None:
+            self.problems += 1
+            if len(self.named) < _NAMED_PROBLEMS:
+                self.named.append(f"{format_time(frame.time)} {frame.problem}")
+
+
+class _EstimatedFrame(NamedTuple):
+    frame: StereoFrame
+    pair: StereoPair
+    estimate: Estimate
+
+
+class FrameConverter:
+    """Converter from frames to output images, whose state can be saved and restored.
+
+    Args:
+        job: Settings of the conversion.
+        survey: Disparities of the whole video.
+
+    Attributes:
+        tally: Counts so far.
+    """
+
+    def __init__(self, job: VideoJob, survey: Survey) -> None:
+        self.survey, self.tally = survey, VideoTally()
+        self._job, self._options = job, MatchOptions(range_px=survey.match_range_px)
+        self._threads = thread_count(job.backend.threads)
+        # One thread is left for the other steps, which take longer than the network.
+        self._matcher = replace(job.backend, threads=max(self._threads - 1, 1)).matcher()
+        self._filter = TemporalFilter(job.backend.threads)
+        self._grouper = FrameGrouper(ShotAligner(swapped=survey.swapped) if job.rectify else None)
+
+    @classmethod
+    def from_state(cls, job: VideoJob, state: dict[str, np.ndarray]) -> "FrameConverter":
+        """Restore a converter from a saved `state`; its output is the same as without an interruption."""
+        low_px, high_px, middle_px, *match_range_px = state.pop("survey_px").tolist()
+        survey = Survey(
+            (low_px, high_px), middle_px, (match_range_px[0], match_range_px[1]) if match_range_px else None
+        )
+        converter = cls(job, survey)
+        frames, cuts, problems = state.pop("tally").tolist()
+        converter.tally = VideoTally(frames, cuts, problems, state.pop("named").tolist())
+        converter._filter = TemporalFilter.from_state(state, job.backend.threads)
+        converter._grouper = FrameGrouper.from_state(state)
+        return converter
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Return everything that affects the output of later frames, as arrays by name."""
+        tally = self.tally
+        return {
+            "survey_px": np.array(
+                [*self.survey.range_px, self.survey.middle_px, *(self.survey.match_range_px or ())]
+            ),
+            "tally": np.array([tally.frames, tally.cuts, tally.problems]),
+            "named": np.array(tally.named, dtype=np.str_),
+            **self._filter.state(),
+            **self._grouper.state(),
+        }
+
+    def convert(self, frames: Iterable[StereoFrame]) -> Iterator[tuple[Fraction, Picture]]:
+        """Yield the time in seconds and the output image of each frame.
+
+        All frames are consumed before the iterator ends, so that `state` is complete.
+        """
+        groups = self._overlap(self._grouper(frames), _GROUPS_AHEAD)
+        matched = self._overlap(map(self._match, groups), _GROUPS_AHEAD)
+        estimated = self._overlap(self._carry(matched), _FRAMES_AHEAD)
+        rendered = self._overlap(map(self._render, estimated), _FRAMES_AHEAD)
+        for frame, picture in rendered:
+            self.tally.add(frame)
+            yield frame.time, picture
+        self.tally.cuts = self._filter.cuts
+
+    def _match(self, group: FrameGroup) -> tuple[FrameGroup, Estimate]:
+        return group, match(self._matcher, group.pairs[-1], self._options)
+
+    def _carry(self, matched: Iterable[tuple[FrameGroup, Estimate]]) -> Iterator[_EstimatedFrame]:
+        """Yield all frames of the groups with their estimates."""
+        for (frames, pairs), estimate in matched:
+            before, last = self._filter.last, pairs[-1]
+            steady = self._filter(last.left, last.right, estimate)
+            carried = carry_between(pairs[:-1], before, self._filter.last, self._threads)
+            yield from map(_EstimatedFrame, frames, pairs, [*carried, steady])
+
+    def _render(self, estimated: _EstimatedFrame) -> tuple[StereoFrame, Picture]:
+        return estimated.frame, self._job.render_frame(estimated.pair, estimated.estimate, self.survey)
+
+    def _overlap(self, items: Iterable[Item], count: int) -> Iterator[Item]:
+        """Compute items ahead of their use, if more than one thread is allowed."""
+        return ahead(items, count) if self._threads > 1 else iter(items)
