@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from stereoweave.cameras.alignment import Alignment, check_pair
 from stereoweave.cameras.camera_fit import Warps
 from stereoweave.cameras.disparity_sign import estimate_depth_order
-from stereoweave.cameras.rectify_uncalibrated import apply_warps, fit_warps
+from stereoweave.cameras.rectify_uncalibrated import fit_warps
 from stereoweave.errors import Note, Remedy, StereoweaveError
 from stereoweave.stereo import StereoPair
 
@@ -40,7 +40,7 @@ def align(pair: StereoPair, *, always: bool = False) -> Aligned:
     """Rectify a pair if its rows are apart, and swap its sides if they are swapped.
 
     A sound pair, or one with too few matches, is returned as it is. A pair whose rows would not come closer
-    is not warped.
+    is not warped. A pair with a camera keeps metric depth where possible (see `rectify_by_features`).
 
     Args:
         pair: The pair.
@@ -73,7 +73,7 @@ def align_rows(pair: StereoPair) -> Aligned:
 
 def _rectify(pair: StereoPair) -> Aligned:
     fit = fit_warps(pair)
-    rectified = apply_warps(pair, fit.warps)
+    rectified = fit.apply(pair)
     alignment = check_pair(rectified.left, rectified.right)
     return Aligned(pair=rectified, alignment=alignment, notes=(fit.note,), warps=fit.warps)
 

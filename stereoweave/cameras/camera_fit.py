@@ -20,10 +20,16 @@ _LEAST_GAIN = 1e-6
 _STEP = 1e-6
 # Scale of the robust loss.
 _SOFT_PX = 0.5
-# Standard deviations of the prior: of the angles in radians, of log(focal length / width), of log(scale) and
-# of the distortion. Where the matches do not determine the solution, the prior selects the smallest change.
-_LIKELY = np.array([0.05] * 5 + [0.3, 0.05, 0.1])
-_ANGLES, _LOG_FOCAL, _LOG_SCALE, _DISTORTION = slice(0, 5), 5, 6, 7
+# Standard deviations of the prior: of the angles in radians, of log(focal length / width), of log(scale), of
+# the distortion and of the right principal point. Where the matches do not determine the solution, the prior
+# selects the smallest change. A standard deviation of _FIXED fixes a parameter.
+_FIXED = 1e-6
+_LIKELY = np.array([0.05] * 5 + [0.3, 0.05, 0.1, _FIXED])
+_ANGLES, _LOG_FOCAL, _LOG_SCALE, _DISTORTION, _LOWER = slice(0, 5), 5, 6, 7, 8
+# The same for cameras of known focal length. Without it, a lower principal point cannot be distinguished from
+# a pitch.
+_PARALLEL = 1e-4
+_LIKELY_IF_KNOWN = np.array([0.05] * 5 + [_FIXED, 0.05, 0.1, 0.02])
 
 
 class Warps(NamedTuple):
@@ -46,12 +52,18 @@ class CameraFit:
 
     Attributes:
         parameters: left yaw and roll, right pitch, yaw and roll in radians, log(focal length / width), log of
-            the right focal length divided by the left one, and the distortion (see `PictureWarp`).
+            the right focal length divided by the left one, the distortion (see `PictureWarp`), and how much
+            lower the right principal point is than the centre, divided by the width.
         size_px: Width and height of the pictures.
+        known_focal_px: Focal length of the left camera, which is not fitted; None if it is unknown.
+        parallel: Whether the cameras look into the same direction, apart from a difference in height. The
+            disparities of the warped pair then give metric depth.
     """
 
-    parameters: Float[np.ndarray, " 8"]
+    parameters: Float[np.ndarray, " 9"]
     size_px: tuple[int, int]
+    known_focal_px: float | None = None
+    parallel: bool = False
 
     @property
     def largest_degrees(self) -> float:
@@ -66,16 +78,29 @@ class CameraFit:
     def distortion(self) -> float:
         return float(self.parameters[_DISTORTION])
 
-    def make_warps(self) -> Warps:
-        """Return the warps that turn both cameras to a common direction, and remove the distortion."""
+    @property
+    def toe_in(self) -> float:
+        """Horizontal angle between the optical axes in radians."""
+        left, right = self.turns
+        return float(right[0, 2] - left[0, 2])
+
+    @property
+    def turns(self) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 3"]]:
+        """Rotations of the left and the right camera to the common direction."""
         left_yaw, left_roll, right_pitch, right_yaw, right_roll = self.parameters[_ANGLES]
         left, _ = cv2.Rodrigues(np.array([0.0, left_yaw, left_roll]))
         right, _ = cv2.Rodrigues(np.array([right_pitch, right_yaw, right_roll]))
+        return left, right
+
+    def make_warps(self) -> Warps:
+        """Return the warps that turn both cameras to a common direction, and remove the distortion."""
+        left, right = self.turns
         width, height = self.size_px
         focal_px = width * np.exp(self.parameters[_LOG_FOCAL])
         camera = np.array([[focal_px, 0, (width - 1) / 2], [0, focal_px, (height - 1) / 2], [0, 0, 1]])
         right_camera = camera.copy()
         right_camera[[0, 1], [0, 1]] *= self.scale
+        right_camera[1, 2] += width * self.parameters[_LOWER]
         homographies = (camera @ left @ np.linalg.inv(camera), camera @ right @ np.linalg.inv(right_camera))
         return Warps(
             *(
@@ -98,21 +123,31 @@ class CameraFit:
         return (right * lines_right).sum(1) / np.sqrt(squared)
 
 
-def fit_cameras(matches: Matches, size_px: tuple[int, int], start: CameraFit | None = None) -> CameraFit:
+def fit_cameras(matches: Matches, size_px: tuple[int, int], known_focal_px: float | None = None) -> CameraFit:
     """Fit two cameras to matches of which few are wrong.
+
+    The fit starts from several distortions; the best result is returned.
 
     Args:
         matches: The matches.
         size_px: Width and height of the pictures.
-        start: Where the fit starts; default: several distortions, of which the best result is returned.
+        known_focal_px: Focal length of the left camera, if known.
     """
-    if start:
-        return _fit_from(start, matches)[0]
+    log_focal = np.log(known_focal_px / size_px[0]) if known_focal_px else 0.0
     starts = (
-        CameraFit(parameters=np.array([0.0] * _DISTORTION + [distortion]), size_px=size_px)
+        CameraFit(
+            parameters=np.array([0.0] * _LOG_FOCAL + [log_focal, 0.0, distortion, 0.0]),
+            size_px=size_px,
+            known_focal_px=known_focal_px,
+        )
         for distortion in _DISTORTIONS
     )
     return min((_fit_from(start, matches) for start in starts), key=lambda found: found[1])[0]
+
+
+def fit_again(start: CameraFit, matches: Matches) -> CameraFit:
+    """Fit the cameras to other matches, starting from an earlier fit."""
+    return _fit_from(start, matches)[0]
 
 
 def _fit_from(fit: CameraFit, matches: Matches) -> tuple[CameraFit, float]:
@@ -136,7 +171,7 @@ def _fit_from(fit: CameraFit, matches: Matches) -> tuple[CameraFit, float]:
     return fit, float(missed @ missed)
 
 
-def _move(fit: CameraFit, step: Sequence[float] | Float[np.ndarray, " 8"]) -> CameraFit:
+def _move(fit: CameraFit, step: Sequence[float] | Float[np.ndarray, " 9"]) -> CameraFit:
     return replace(fit, parameters=fit.parameters + step)
 
 
@@ -144,4 +179,14 @@ def _list_errors(fit: CameraFit, matches: Matches) -> Float[np.ndarray, " n"]:
     """Return the roots of the terms of the loss: one for each match, and one for each parameter's prior."""
     missed_px = fit.measure_sampson_px(matches)
     softened = np.sign(missed_px) * _SOFT_PX * np.sqrt(np.log1p((missed_px / _SOFT_PX) ** 2))
-    return np.concatenate([softened, fit.parameters / _LIKELY])
+    return np.concatenate([softened, _list_prior_errors(fit)])
+
+
+def _list_prior_errors(fit: CameraFit) -> Float[np.ndarray, " m"]:
+    if fit.known_focal_px is None:
+        return fit.parameters / _LIKELY
+    middle = np.zeros(len(fit.parameters))
+    middle[_LOG_FOCAL] = np.log(fit.known_focal_px / fit.size_px[0])
+    errors = (fit.parameters - middle) / _LIKELY_IF_KNOWN
+    # Rows tell little about the angle between the cameras, but all disparities depend on it.
+    return np.append(errors, fit.toe_in / _PARALLEL) if fit.parallel else errors

@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from stereoweave.cameras.camera_fit import CameraFit, Warps, fit_cameras
+from stereoweave.cameras.camera_fit import CameraFit, Warps, fit_again, fit_cameras
 from stereoweave.cameras.feature_matches import Matches, find_matches
 from stereoweave.cameras.rectify import Rectified
 from stereoweave.cameras.row_field import RowField, fit_row_field
 from stereoweave.errors import Note, Remedy, StereoweaveError
-from stereoweave.stereo import StereoPair
+from stereoweave.stereo import StereoCamera, StereoPair
 
 _LEAST_MATCHES = 40
 _LEAST_RIGHT_SHARE = 0.3
@@ -30,6 +30,8 @@ _FIELD_PX = 6.0
 _FIELD_SHARE = 0.8
 _SOFT_PX = 0.5
 _MOST_TURN_DEGREES = 20.0
+# Cameras are taken for parallel up to this angle between them, whose fit is wrong by up to 0.1 degrees.
+_MOST_TOE_IN_DEGREES = 0.5
 # Largest difference in focal length; a larger one is taken for a camera that moved forward.
 _MOST_SCALE = 0.07
 _MOST_RESIDUAL_PX = 1.0
@@ -47,14 +49,35 @@ class Fit:
     """The warps that rectify a pair, and what is known about them.
 
     Attributes:
+        cameras: The fitted cameras.
         warps: Warps of both pictures.
         matches: The matches that agree with the warps, in px of the original pictures.
         note: Description of the warps.
     """
 
+    cameras: CameraFit
     warps: Warps
     matches: Matches
     note: Note
+
+    def apply(self, pair: StereoPair) -> StereoPair:
+        """Warp both pictures of a pair; the result has masks, and a camera if the fit gives metric depth."""
+        camera = self._warp_camera(pair.camera) if pair.camera and self.cameras.parallel else None
+        return replace(apply_warps(pair, self.warps), camera=camera)
+
+    def _warp_camera(self, camera: StereoCamera) -> StereoCamera:
+        """Return the camera of the warped pair: turns keep a camera, but scaling and moving change it."""
+        turned = self.cameras.make_warps().left.homography
+        moved = self.warps.left.homography @ np.linalg.inv(turned)
+        zoom = float(moved[0, 0])
+        cx_px, cy_px, _ = (moved @ [camera.cx_px, camera.cy_px, 1.0]).tolist()
+        return StereoCamera(
+            focal_px=zoom * camera.focal_px,
+            baseline_m=camera.baseline_m,
+            cx_px=cx_px,
+            cy_px=cy_px,
+            doffs_px=zoom * camera.doffs_px,
+        )
 
 
 class _Candidate(NamedTuple):
@@ -69,8 +92,11 @@ def rectify_by_features(pair: StereoPair) -> Rectified:
 
     Both pictures are warped by the smallest camera rotations that suffice. The focal length, the difference
     in scale and the lens distortion are fitted too. Unlike arbitrary homographies, rotations preserve shapes.
-    If rows remain apart, as with a rolling shutter, a smooth field of vertical moves aligns them. The result
-    has no camera, because neither focal length nor baseline is known well enough for metric depth.
+    If rows remain apart, as with a rolling shutter, a smooth field of vertical moves aligns them.
+
+    The result has a camera if the pair has one and the fit finds its cameras parallel. The focal length is
+    then kept, and the result is not moved sideways, so that disparity gives metric depth. Otherwise, where
+    infinity is remains unknown.
 
     Source: "Quasi-Euclidean epipolar rectification of uncalibrated images" (Fusiello and Irsara 2011).
 
@@ -78,7 +104,7 @@ def rectify_by_features(pair: StereoPair) -> Rectified:
         StereoweaveError: There are too few matches, or no rotation aligns their rows.
     """
     found = fit_warps(pair)
-    return Rectified(pair=apply_warps(pair, found.warps), notes=(found.note,))
+    return Rectified(pair=found.apply(pair), notes=(found.note,))
 
 
 def apply_warps(pair: StereoPair, warps: Warps) -> StereoPair:
@@ -93,15 +119,32 @@ def fit_warps(pair: StereoPair) -> Fit:
     height, width = pair.left.shape[:2]
     scale = max(1.0, (width * height / _PIXELS_OF_DISTANCE) ** 0.5)
     found = find_matches(pair.left, pair.right)
-    cameras = fit_cameras(_select_inliers(found, scale * _FIRST_PX), (width, height))
+    first = _select_inliers(found, scale * _FIRST_PX)
+    if pair.camera:
+        with suppress(StereoweaveError):
+            cameras = fit_cameras(first, (width, height), pair.camera.focal_px)
+            cameras = _fit_closely(cameras, found, scale)
+            if abs(np.degrees(cameras.toe_in)) < _MOST_TOE_IN_DEGREES:
+                return _finish(replace(cameras, parallel=True), found, scale)
+    return _finish(_fit_closely(fit_cameras(first, (width, height)), found, scale), found, scale)
+
+
+def _fit_closely(cameras: CameraFit, found: Matches, scale: float) -> CameraFit:
+    """Fit the cameras to the matches within smaller and smaller distances."""
     for within_px in _SELECTIONS_PX:
         cameras = _fit_again(cameras, found, scale * within_px)
+    return cameras
+
+
+def _finish(cameras: CameraFit, found: Matches, scale: float) -> Fit:
+    if cameras.parallel:
+        cameras = _fit_again(cameras, found, scale * _SELECTIONS_PX[-1])
     smooth = _bend_rows(_place(cameras, found, scale), found, scale)
     chosen = smooth or _place(_fit_again(cameras, found, scale * _RIGHT_PX), found, scale)
     missed_px = np.abs(chosen.warps.transform(found).lower_px)
     agreeing = _require_enough(found, missed_px < scale * _RIGHT_PX)
     _check(chosen.cameras, float(np.median(missed_px[missed_px < scale * _SELECTIONS_PX[-1]])), scale)
-    return Fit(warps=chosen.warps, matches=agreeing, note=_describe(chosen, agreeing))
+    return Fit(cameras=chosen.cameras, warps=chosen.warps, matches=agreeing, note=_describe(chosen, agreeing))
 
 
 def _select_inliers(found: Matches, within_px: float) -> Matches:
@@ -121,7 +164,7 @@ def _select_inliers(found: Matches, within_px: float) -> Matches:
 def _fit_again(cameras: CameraFit, found: Matches, within_px: float) -> CameraFit:
     """Fit the cameras to the matches within this distance of their epipolar lines."""
     matches = _require_enough(found, np.abs(cameras.measure_sampson_px(found)) < within_px)
-    return fit_cameras(matches, cameras.size_px, cameras)
+    return fit_again(cameras, matches)
 
 
 def _require_enough(found: Matches, right_ones: Bool[np.ndarray, " n"]) -> Matches:
@@ -141,7 +184,8 @@ def _require_enough(found: Matches, right_ones: Bool[np.ndarray, " n"]) -> Match
 def _place(cameras: CameraFit, found: Matches, scale: float) -> _Candidate:
     """Return the cameras' warps, moved and scaled so that little of the pictures is lost.
 
-    The left picture stays centred. The right one is shifted to the left if disparities would be negative.
+    The left picture stays centred. The right one is shifted to the left if disparities would be negative,
+    unless they give metric depth.
     """
     warps = cameras.make_warps()
     matches = _require_enough(found, np.abs(cameras.measure_sampson_px(found)) < scale * _SELECTIONS_PX[-1])
@@ -150,6 +194,8 @@ def _place(cameras: CameraFit, found: Matches, scale: float) -> _Candidate:
     warps = Warps(warps.left.shifted((back_x, back_y)), warps.right.shifted((back_x, back_y)))
     zoom = _find_zoom(warps)
     warps = Warps(*(warp.scaled(zoom) for warp in warps))
+    if cameras.parallel:
+        return _Candidate(cameras, warps)
     least_px = np.percentile(warps.transform(matches).disparity_px, _OUTER_PERCENT)
     moved_px = float(np.floor(min(least_px, 0.0)))
     return _Candidate(cameras, Warps(warps.left, warps.right.shifted((moved_px, 0.0))))

@@ -59,7 +59,8 @@ def prepare(pictures: Sequence[Path], request: Request) -> Prepared:
     """Open a pair from two pictures (left first) or one picture with both views; rectify it if needed.
 
     The camera comes from the calibration, from the request, or from EXIF. The pair has no camera if the
-    focal length or the baseline is unknown, or if the pair was rectified from feature matches.
+    focal length or the baseline is unknown, or if rectification from feature matches did not find the cameras
+    parallel.
 
     Raises:
         StereoweaveError: See `open_pictures`, `read_rig`, `rectify` and `rectify_by_features`; or the request
@@ -130,7 +131,7 @@ class _Ready:
 def _align(pair: StereoPair, rectified: bool | None) -> _Ready:
     """Rectify the pair from feature matches, always, never, or by default where needed.
 
-    A rectified pair has no camera, as disparity at infinity is then unknown.
+    If the cameras were not parallel, the rectified pair has no camera, as disparity at infinity is unknown.
     """
     if rectified is False:
         return _Ready(pair)
@@ -139,7 +140,7 @@ def _align(pair: StereoPair, rectified: bool | None) -> _Ready:
     if pair.camera is None or ready.pair.camera is not None:
         return ready
     lost = Note(
-        "no depth in metres after rectification from feature matches",
+        "no depth in metres: rectification from feature matches did not find the cameras parallel",
         Remedy("give a calibration", ("calibration",)),
     )
     return replace(ready, notes=(*ready.notes, lost))

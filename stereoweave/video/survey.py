@@ -3,15 +3,15 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from fractions import Fraction
-from itertools import islice
+from itertools import groupby, islice
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from rich.progress import Progress
 
-from stereoweave.cameras.alignment import SWAPPED
-from stereoweave.cameras.auto_align import align
+from stereoweave.cameras.alignment import SWAPPED, check_pair
+from stereoweave.cameras.auto_align import Aligned, align
 from stereoweave.cameras.diagnosis import find_problems
 from stereoweave.errors import Note, Remedy
 from stereoweave.io.colormap import find_colour_range_px
@@ -24,6 +24,7 @@ from stereoweave.video.reader import StereoVideo, format_time
 
 _SURVEYED_FRAMES, _CHECKED_FRAMES = 24, 3
 _SURVEY_STEP_PX = 4
+_NAMED_SPANS = 3
 # The percentiles exclude outliers. The margin allows for objects that come nearer between surveyed frames.
 _OUTER_PERCENT, _MARGIN_PX = 0.5, 8.0
 
@@ -55,20 +56,21 @@ def survey_video(
     picked = _spread_evenly(video.frame_count, _SURVEYED_FRAMES)
     checked = set(picked[len(picked) // 6 :: -(-len(picked) // _CHECKED_FRAMES)])
     shown = bar.add_task("surveying depth", total=len(picked), loss="", rate="")
-    thinned, middles_px, defects, swapped = [], [], [], []
+    thinned, middles_px, defects, swapped, flat = [], [], [], [], []
     frames = islice(video.frames(), picked.start, picked.stop, picked.step)
     for index, frame in zip(picked, frames, strict=True):
         pair = StereoPair(left=frame.left, right=frame.right)
-        aligned = align(pair) if rectified else None
-        pair = aligned.pair if aligned else pair
-        swapped.append(aligned is not None and aligned.swapped)
-        estimate = match(matcher, pair)
+        aligned = (
+            align(pair) if rectified else Aligned(pair=pair, alignment=check_pair(pair.left, pair.right))
+        )
+        swapped.append(aligned.swapped)
+        estimate = match(matcher, aligned.pair)
         thinned.append(estimate.disparity_px[::_SURVEY_STEP_PX, ::_SURVEY_STEP_PX])
         middles_px.append(median_disparity_px(estimate))
+        flat.append((frame.time, "same_picture" in aligned.alignment.defects))
         if index in checked:
-            problems = find_problems(pair, estimate, aligned.alignment if aligned else None)
-            notes = [*(aligned.notes if aligned else ()), *problems]
-            defects.append([_add_time(frame.time, note, video) for note in notes])
+            problems = [] if flat[-1][1] else find_problems(aligned.pair, estimate, aligned.alignment)
+            defects.append([_add_time(frame.time, note, video) for note in [*aligned.notes, *problems]])
         bar.advance(shown)
     all_px = np.vstack(thinned)
     survey = Survey(
@@ -77,7 +79,20 @@ def survey_video(
         _find_match_range_px(all_px, matcher),
         2 * sum(swapped) > len(swapped),
     )
-    return survey, _select_common_notes(defects)
+    return survey, [*_note_flat(flat), *_select_common_notes(defects)]
+
+
+def _note_flat(frames: Sequence[tuple[Fraction, bool]]) -> list[Note]:
+    """Return a note on the flat ones of the surveyed frames, whose time and flatness are given."""
+    spans = []
+    for is_flat, run in groupby(frames, key=lambda frame: frame[1]):
+        times = [format_time(time) for time, _ in run]
+        if is_flat:
+            spans.append(times[0] if len(times) == 1 else f"{times[0]} to {times[-1]}")
+    if not spans:
+        return []
+    named = ", ".join([*spans[:_NAMED_SPANS], *(["..."] if len(spans) > _NAMED_SPANS else [])])
+    return [Note(f"{named} flat: both views are the same picture, so no depth can be seen")]
 
 
 def _find_match_range_px(

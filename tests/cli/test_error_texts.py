@@ -115,8 +115,9 @@ NOTES = {
     "(stereoweave rectify)",
     "check both.png": "side_by_side, detected from name and content; override it if it is wrong (--format)",
     "check right.png left.png": "left and right are swapped; give them the other way round",
-    f"depth {PAIR} --focal-px 600 --baseline-m 0.1 --rectify -o out": "no depth in metres after "
-    "rectification from feature matches; give a calibration (--calib)",
+    "depth inwards_left.png inwards_right.png --focal-px 640 --baseline-m 0.1 --rectify --model small "
+    "-o out": "no depth in metres: rectification from feature matches did not find the cameras parallel; "
+    "give a calibration (--calib)",
     f"depth {PAIR} --write all -o out": f"no depth, point cloud or mesh: {NO_CAMERA}",
     "view upper.png lower.png --model small --no-rectify -o out.png": "the right picture is 2.0 px lower "
     "than the left one; rectify the pair (--rectify)",

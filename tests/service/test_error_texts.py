@@ -63,9 +63,10 @@ NOTES: dict[str, tuple[dict[str, str], dict[str, Any]]] = {
         {"picture": "both.png"},
         {},
     ),
-    "no depth in metres after rectification from feature matches; give a calibration (calib)": (
-        PAIR,
-        {"focal_px": 600, "baseline_m": 0.1, "rectify": True},
+    "no depth in metres: rectification from feature matches did not find the cameras parallel; give a "
+    "calibration (calib)": (
+        {"left": "inwards_left.png", "right": "inwards_right.png"},
+        {"focal_px": 640, "baseline_m": 0.1, "rectify": True},
     ),
 }
 
