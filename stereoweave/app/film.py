@@ -16,6 +16,7 @@ from stereoweave.io.animation import require_video_extra
 from stereoweave.matching.backend import Backend
 from stereoweave.rendering.layouts import LayoutOptions, add_mark
 from stereoweave.stereo import StereoPair
+from stereoweave.system.progress import format_duration
 
 if TYPE_CHECKING:
     from stereoweave.video.frame_converter import VideoTally
@@ -119,7 +120,7 @@ def convert_film(film: Film, folder: Path, report: Callable[[float, str], None])
     summary = _describe(film, video)
     if film.start_s is not None:
         whole_s = shown.spent_s / video.frame_count * whole_count
-        summary += f" A preview has no sound. The whole film takes about {_format_duration(whole_s)}."
+        summary += f" A preview has no sound. The whole film takes about {format_duration(whole_s)}."
     return ConvertedFilm(out, summary, [*console.lines, *_describe_problems(tally)])
 
 
@@ -152,7 +153,7 @@ class _FrameReport:
         if self._passes == 1:
             self._report(_SURVEY_SHARE * share, "looking through the film")
             return
-        left = number and f", about {_format_duration(self.spent_s / number * (self._count - number))} left"
+        left = number and f", about {format_duration(self.spent_s / number * (self._count - number))} left"
         self._report(
             _SURVEY_SHARE + (1 - _SURVEY_SHARE) * share, f"frame {number + 1} of {self._count}{left or ''}"
         )
@@ -161,14 +162,6 @@ class _FrameReport:
     def spent_s(self) -> float:
         """The time since the conversion began."""
         return time.monotonic() - self._begin_s
-
-
-def _format_duration(seconds: float) -> str:
-    """Format a duration, rounded as befits an estimate."""
-    if seconds < 90:
-        return f"{max(1, round(seconds))} s"
-    minutes = round(seconds / 60)
-    return f"{minutes} min" if minutes < 90 else f"{seconds / 3600:.1f} h"
 
 
 class _NoteConsole(Console):

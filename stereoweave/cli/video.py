@@ -20,6 +20,7 @@ from stereoweave.errors import StereoweaveError
 
 if TYPE_CHECKING:
     from stereoweave.video.frame_converter import VideoTally
+    from stereoweave.video.reader import StereoVideo
 
 _HIGHEST_RATE = 1000
 
@@ -87,6 +88,16 @@ Rate = Annotated[
 ]
 
 
+Preview = Annotated[
+    str | None,
+    typer.Option(
+        metavar="SECONDS",
+        help="Convert only this much from the middle of the video, such as 5s, without sound, and report how "
+        "long the whole video would take.",
+    ),
+]
+
+
 RectifyShots = Annotated[
     bool,
     typer.Option(
@@ -108,6 +119,7 @@ def video(  # noqa: PLR0913 - each is an option of the command line
     format: Format = None,
     rate: Rate = None,
     rectify: RectifyShots = True,
+    preview: Preview = None,
     model: Model = "small",
     threads: Threads = None,
     provider: Provider = "cpu",
@@ -118,6 +130,7 @@ def video(  # noqa: PLR0913 - each is an option of the command line
 
     from stereoweave.io.animation import require_video_extra
     from stereoweave.matching.backend import Backend
+    from stereoweave.system.progress import format_duration
     from stereoweave.video.reader import open_video
 
     with require_video_extra("a video"):
@@ -138,7 +151,11 @@ def video(  # noqa: PLR0913 - each is an option of the command line
             backend=Backend(model=model, threads=threads, provider=provider),
             name_of=running_options(),
         )
+        length_s = None if preview is None else _parse_length_s(preview)
         source = open_video(videos, format, rate=None if rate is None else _parse_rate(rate))
+        whole_count = source.frame_count
+        if length_s is not None:
+            source = _cut_from_middle(source, length_s)
         if layout:
             out = _add_mark(out, layout, source.size_px)
         make_parent_folder(out)
@@ -153,6 +170,8 @@ def video(  # noqa: PLR0913 - each is an option of the command line
         typer.echo(f"stereoweave: {out}: stopped; {state}", err=True)
         raise typer.Exit(130) from None
     _print_tally(out, tally)
+    if length_s is not None:
+        typer.echo(f"the whole video takes about {format_duration(whole_count / tally.frames_per_s)}")
 
 
 def _parse_rate(rate: str) -> Fraction:
@@ -168,6 +187,23 @@ def _parse_rate(rate: str) -> Fraction:
             f"30000/1001, found {rate!r}"
         )
     return fraction
+
+
+def _parse_length_s(preview: str) -> float:
+    """Parse --preview into seconds; accepts numbers such as 5, 5s and 2.5s."""
+    try:
+        length_s = float(preview.removesuffix("s"))
+    except ValueError:
+        length_s = 0.0
+    if not 0 < length_s < float("inf"):
+        raise StereoweaveError(f"--preview: expected seconds above 0, such as 5s, found {preview!r}")
+    return length_s
+
+
+def _cut_from_middle(video: "StereoVideo", length_s: float) -> "StereoVideo":
+    """Return a part of this length from the middle of the video, whose start may be a title."""
+    whole_s = float(video.frame_count / video.rate)
+    return video.excerpt(max(0.0, (whole_s - length_s) / 2), length_s)
 
 
 def _add_mark(out: Path, layout: str, size_px: tuple[int, int]) -> Path:

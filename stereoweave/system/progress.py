@@ -56,6 +56,14 @@ def show_steps() -> Iterator[None]:
         _display.reset(token)
 
 
+def format_duration(seconds: float) -> str:
+    """Format a duration, rounded as befits an estimate."""
+    if seconds < 90:
+        return f"{max(1, round(seconds))} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 90 else f"{seconds / 3600:.1f} h"
+
+
 class _Line:
     """A line in a terminal that shows the current step; a listener."""
 

@@ -9,7 +9,7 @@ from stereoweave.video.temporal_filter import SAME_PX, SAME_SHARE
 
 RADIUS_PX = 3
 """Greatest distance of a window's pixels from its centre, along rows and columns."""
-MOST_LEVELS = 40.0
+MOST_LEVELS = np.float32(40)
 """A pixel of a window counts at most this difference, because it may lie on another surface."""
 
 
@@ -56,46 +56,42 @@ def take_pixels(own, other, towards, before, after, share, weights, disparity_px
             certain, later = before_confidence[row, column], after_confidence[later_row, later_column]
             part = share
             if abs(to_px - from_px) > SAME_PX + SAME_SHARE * abs(from_px):
-                apart = measure_unlikeness(own, before_grey, weights, y, x, row, column)
-                apart += measure_mismatch(own, other, weights, y, x, towards * from_px)
-                later_apart = measure_unlikeness(own, after_grey, weights, y, x, later_row, later_column)
-                later_apart += measure_mismatch(own, other, weights, y, x, towards * to_px)
-                part = 0.0 if apart <= later_apart else 1.0
+                # Four comparisons in one loop, which takes half the time of four loops.
+                place, later_place = x + towards * from_px, x + towards * to_px
+                whole, later_whole = int(np.floor(place)), int(np.floor(later_place))
+                past, later_past = np.float32(place - whole), np.float32(later_place - later_whole)
+                centre = np.float32(own[y, x])
+                apart = later_apart = np.float32(0)
+                for dy in range(-RADIUS_PX, RADIUS_PX + 1):
+                    here_row = min(max(y + dy, 0), height - 1)
+                    from_row = min(max(row + dy, 0), height - 1)
+                    to_row = min(max(later_row + dy, 0), height - 1)
+                    for dx in range(-RADIUS_PX, RADIUS_PX + 1):
+                        level = np.float32(own[here_row, min(max(x + dx, 0), width - 1)])
+                        weight = weights[int(abs(level - centre))]
+                        shown = np.float32(before_grey[from_row, min(max(column + dx, 0), width - 1)])
+                        match = sample(other, here_row, whole + dx, past)
+                        apart += weight * (differ(level, shown) + differ(level, match))
+                        shown = np.float32(after_grey[to_row, min(max(later_column + dx, 0), width - 1)])
+                        match = sample(other, here_row, later_whole + dx, later_past)
+                        later_apart += weight * (differ(level, shown) + differ(level, match))
+                part = np.float32(0) if apart <= later_apart else np.float32(1)
             disparity_px[y, x] = from_px + part * (to_px - from_px)
             confidence[y, x] = certain + part * (later - certain)
 
 
 @inlined
 @typing.no_type_check
-def measure_unlikeness(own, source, weights, y, x, row, column):
-    """Return the weighted difference of the window at (y, x) from the window at (row, column) of a source."""
-    height, width = own.shape
-    total = np.float32(0)
-    for dy in range(-RADIUS_PX, RADIUS_PX + 1):
-        own_row, source_row = min(max(y + dy, 0), height - 1), min(max(row + dy, 0), height - 1)
-        for dx in range(-RADIUS_PX, RADIUS_PX + 1):
-            here = own[own_row, min(max(x + dx, 0), width - 1)]
-            there = source[source_row, min(max(column + dx, 0), width - 1)]
-            weight = weights[abs(int(here) - int(own[y, x]))]
-            total += weight * min(abs(np.float32(here) - np.float32(there)), np.float32(MOST_LEVELS))
-    return total
+def differ(level, other):
+    """Return the difference of two grey levels, at most `MOST_LEVELS`."""
+    return min(abs(level - other), MOST_LEVELS)
 
 
 @inlined
 @typing.no_type_check
-def measure_mismatch(own, other, weights, y, x, offset_px):
-    """Return the weighted difference of the window at (y, x) from the other view's, offset by px."""
-    height, width = own.shape
-    whole = int(np.floor(x + offset_px))
-    part = np.float32(x + offset_px - whole)
-    total = np.float32(0)
-    for dy in range(-RADIUS_PX, RADIUS_PX + 1):
-        row = min(max(y + dy, 0), height - 1)
-        for dx in range(-RADIUS_PX, RADIUS_PX + 1):
-            here = own[row, min(max(x + dx, 0), width - 1)]
-            first = np.float32(other[row, min(max(whole + dx, 0), width - 1)])
-            second = np.float32(other[row, min(max(whole + dx + 1, 0), width - 1)])
-            there = first + part * (second - first)
-            weight = weights[abs(int(here) - int(own[y, x]))]
-            total += weight * min(abs(np.float32(here) - there), np.float32(MOST_LEVELS))
-    return total
+def sample(image, row, column, past):
+    """Return the grey level at a place between a column and the next one."""
+    last = image.shape[1] - 1
+    first = np.float32(image[row, min(max(column, 0), last)])
+    second = np.float32(image[row, min(max(column + 1, 0), last)])
+    return first + past * (second - first)

@@ -16,7 +16,7 @@ from stereoweave.errors import StereoweaveError
 from stereoweave.io.output_lock import lock_output
 from stereoweave.system.progress import progress
 from stereoweave.system.threads import thread_count
-from stereoweave.video.frame_converter import FrameConverter, VideoTally
+from stereoweave.video.frame_converter import FrameConverter, VideoTally, load_matcher
 from stereoweave.video.job import VideoJob
 from stereoweave.video.parts import open_parts
 from stereoweave.video.reader import StereoVideo, format_time
@@ -76,7 +76,9 @@ def convert_video(
             done_s = converter.tally.frames / video.rate
             _print_line(console, f"{out.name}: resuming at {format_time(Fraction(round(done_s)))[:-4]}")
         else:
-            survey, notes = survey_video(video, job.backend.matcher(), bar, rectified=job.rectify)
+            survey, notes = survey_video(
+                video, load_matcher(job), bar, rectified=job.rectify, threads=job.backend.threads
+            )
             converter = FrameConverter(job, survey)
             for note in [*notes, *job.find_losses(survey)]:
                 _print_line(console, note.format(job.name_of))

@@ -8,6 +8,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from stereoweave.matching.estimate import match
+from stereoweave.matching.matcher import Matcher
 from stereoweave.matching.options import MatchOptions
 from stereoweave.stereo import Estimate, StereoPair
 from stereoweave.system.ahead import ahead
@@ -50,6 +51,11 @@ class VideoTally:
                 self.named.append(f"{format_time(frame.time)} {frame.problem}")
 
 
+def load_matcher(job: VideoJob) -> Matcher:
+    """Load a job's network for use beside other steps, which together take longer than the network."""
+    return replace(job.backend, threads=max(thread_count(job.backend.threads) - 1, 1)).matcher()
+
+
 class _EstimatedFrame(NamedTuple):
     frame: StereoFrame
     pair: StereoPair
@@ -71,8 +77,7 @@ class FrameConverter:
         self.survey, self.tally = survey, VideoTally()
         self._job, self._options = job, MatchOptions(range_px=survey.match_range_px)
         self._threads = thread_count(job.backend.threads)
-        # One thread is left for the other steps, which take longer than the network.
-        self._matcher = replace(job.backend, threads=max(self._threads - 1, 1)).matcher()
+        self._matcher = load_matcher(job)
         self._filter = TemporalFilter(job.backend.threads)
         self._grouper = FrameGrouper(ShotAligner(swapped=survey.swapped) if job.rectify else None)
 

@@ -1,11 +1,13 @@
 """Survey of a video before its conversion: disparities and defects of frames from the whole video."""
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from fractions import Fraction
 from itertools import groupby, islice
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from jaxtyping import Float
 from rich.progress import Progress
@@ -15,14 +17,19 @@ from stereoweave.cameras.auto_align import Aligned, align
 from stereoweave.cameras.diagnosis import find_problems
 from stereoweave.errors import Note, Remedy
 from stereoweave.io.colormap import find_colour_range_px
+from stereoweave.io.images import SMALLEST_SIDE_PX
 from stereoweave.matching.estimate import match
 from stereoweave.matching.matcher import Matcher
 from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS
 from stereoweave.rendering.layouts import median_disparity_px
+from stereoweave.rendering.scaling import fit_size
 from stereoweave.stereo import StereoPair
-from stereoweave.video.reader import StereoVideo, format_time
+from stereoweave.system.threads import thread_count
+from stereoweave.video.reader import StereoFrame, StereoVideo, format_time
 
 _SURVEYED_FRAMES, _CHECKED_FRAMES = 24, 3
+# Unchecked frames are matched at this width, where a range of disparities is found as well.
+_SURVEYED_WIDTH_PX = 320
 _SURVEY_STEP_PX = 4
 _NAMED_SPANS = 3
 # The percentiles exclude outliers. The margin allows for objects that come nearer between surveyed frames.
@@ -45,8 +52,30 @@ class Survey(NamedTuple):
     swapped: bool = False
 
 
+class _Sample(NamedTuple):
+    """What a frame shows.
+
+    Attributes:
+        time: Time of the frame in seconds.
+        disparities_px: Disparities of a grid of pixels [N, 1].
+        middle_px: Median disparity.
+        alignment: The frame's alignment.
+        notes: Notes on the frame; None if it was not checked for problems.
+    """
+
+    time: Fraction
+    disparities_px: np.ndarray
+    middle_px: float
+    alignment: Aligned
+    notes: list[Note] | None
+
+    @property
+    def is_flat(self) -> bool:
+        return "same_picture" in self.alignment.alignment.defects
+
+
 def survey_video(
-    video: StereoVideo, matcher: Matcher, bar: Progress, *, rectified: bool = True
+    video: StereoVideo, matcher: Matcher, bar: Progress, *, rectified: bool = True, threads: int | None = None
 ) -> tuple[Survey, list[Note]]:
     """Measure the disparities of frames spread over the whole video, and find defects.
 
@@ -56,37 +85,65 @@ def survey_video(
     picked = _spread_evenly(video.frame_count, _SURVEYED_FRAMES)
     checked = set(picked[len(picked) // 6 :: -(-len(picked) // _CHECKED_FRAMES)])
     shown = bar.add_task("surveying depth", total=len(picked), loss="", rate="")
-    thinned, middles_px, defects, swapped, flat = [], [], [], [], []
     frames = islice(video.frames(), picked.start, picked.stop, picked.step)
-    for index, frame in zip(picked, frames, strict=True):
-        pair = StereoPair(left=frame.left, right=frame.right)
-        aligned = (
-            align(pair) if rectified else Aligned(pair=pair, alignment=check_pair(pair.left, pair.right))
-        )
-        swapped.append(aligned.swapped)
-        estimate = match(matcher, aligned.pair)
-        thinned.append(estimate.disparity_px[::_SURVEY_STEP_PX, ::_SURVEY_STEP_PX])
-        middles_px.append(median_disparity_px(estimate))
-        flat.append((frame.time, "same_picture" in aligned.alignment.defects))
-        if index in checked:
-            problems = [] if flat[-1][1] else find_problems(aligned.pair, estimate, aligned.alignment)
-            defects.append([_add_time(frame.time, note, video) for note in [*aligned.notes, *problems]])
-        bar.advance(shown)
-    all_px = np.vstack(thinned)
+    samples = []
+    with ThreadPoolExecutor(thread_count(threads)) as pool:
+        for sample in pool.map(
+            lambda index, frame: _sample_frame(frame, matcher, rectified=rectified, checked=index in checked),
+            picked,
+            frames,
+        ):
+            samples.append(sample)
+            bar.advance(shown)
+    defects = [
+        [_add_time(sample.time, note, video) for note in sample.notes]
+        for sample in samples
+        if sample.notes is not None
+    ]
+    all_px = np.vstack([sample.disparities_px for sample in samples])
     survey = Survey(
         find_colour_range_px(all_px),
-        float(np.median(middles_px)),
+        float(np.median([sample.middle_px for sample in samples])),
         _find_match_range_px(all_px, matcher),
-        2 * sum(swapped) > len(swapped),
+        2 * sum(sample.alignment.swapped for sample in samples) > len(samples),
     )
-    return survey, [*_note_flat(flat), *_select_common_notes(defects)]
+    return survey, [*_note_flat(samples), *_select_common_notes(defects)]
 
 
-def _note_flat(frames: Sequence[tuple[Fraction, bool]]) -> list[Note]:
-    """Return a note on the flat ones of the surveyed frames, whose time and flatness are given."""
+def _sample_frame(frame: StereoFrame, matcher: Matcher, *, rectified: bool, checked: bool) -> _Sample:
+    """Measure a frame; unless it is `checked` for problems, at a smaller size."""
+    pair, scale = StereoPair(left=frame.left, right=frame.right), 1.0
+    if not checked:
+        pair, scale = _scale_down(pair)
+    aligned = align(pair) if rectified else Aligned(pair=pair, alignment=check_pair(pair.left, pair.right))
+    estimate = match(matcher, aligned.pair)
+    step = max(1, round(_SURVEY_STEP_PX / scale))
+    sample = _Sample(
+        frame.time,
+        scale * estimate.disparity_px[::step, ::step].reshape(-1, 1),
+        scale * median_disparity_px(estimate),
+        aligned,
+        list(aligned.notes) if checked else None,
+    )
+    if sample.notes is not None and not sample.is_flat:
+        sample.notes.extend(find_problems(aligned.pair, estimate, aligned.alignment))
+    return sample
+
+
+def _scale_down(pair: StereoPair) -> tuple[StereoPair, float]:
+    """Return the pair at a size that is soon matched, and its width divided by the new one."""
+    height, width = pair.left.shape[:2]
+    scale = width / fit_size(pair.left.shape, (_SURVEYED_WIDTH_PX, height))[0]
+    size = round(width / scale), max(round(height / scale), SMALLEST_SIDE_PX)
+    left, right = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (pair.left, pair.right))
+    return StereoPair(left=left, right=right), scale
+
+
+def _note_flat(samples: Sequence[_Sample]) -> list[Note]:
+    """Return a list with a note on the flat frames, if there are any."""
     spans = []
-    for is_flat, run in groupby(frames, key=lambda frame: frame[1]):
-        times = [format_time(time) for time, _ in run]
+    for is_flat, run in groupby(samples, key=lambda sample: sample.is_flat):
+        times = [format_time(sample.time) for sample in run]
         if is_flat:
             spans.append(times[0] if len(times) == 1 else f"{times[0]} to {times[-1]}")
     if not spans:
@@ -96,7 +153,7 @@ def _note_flat(frames: Sequence[tuple[Fraction, bool]]) -> list[Note]:
 
 
 def _find_match_range_px(
-    disparity_px: Float[np.ndarray, "h w"], matcher: Matcher
+    disparity_px: Float[np.ndarray, "n 1"], matcher: Matcher
 ) -> tuple[float, float] | None:
     """Return the disparity range to match; None if the network's own range covers all disparities."""
     low_px, high_px = np.percentile(disparity_px, [_OUTER_PERCENT, 100 - _OUTER_PERCENT]).tolist()
