@@ -58,6 +58,7 @@ def convert_video(
             because the disk is full.
     """
     _check_output(out, job, video, sources)
+    matcher = load_matcher(job)
     recorder = Recorder(
         encoding=GREY16 if job.depth16 else H264,
         time_base=video.time_base,
@@ -77,7 +78,7 @@ def convert_video(
             _print_line(console, f"{out.name}: resuming at {format_time(Fraction(round(done_s)))[:-4]}")
         else:
             survey, notes = survey_video(
-                video, load_matcher(job), bar, rectified=job.rectify, threads=job.backend.threads
+                video, matcher, bar, rectified=job.rectify, threads=job.backend.threads
             )
             converter = FrameConverter(job, survey)
             for note in [*notes, *job.find_losses(survey)]:

@@ -170,14 +170,17 @@ def _red_from_green(anaglyph: np.ndarray) -> float:
     return np.abs(anaglyph[..., 0].astype(int) - anaglyph[..., 1]).mean()
 
 
-class Interrupted(StereoVideo):
-    """Video whose reader raises the signal of Ctrl-C at frame 8, once a part is finished."""
+def interrupt(patch: pytest.MonkeyPatch) -> None:
+    """Let the reader raise the signal of Ctrl-C at frame 8, once a part is finished."""
+    read = StereoVideo.frames
 
-    def frames(self, start: int = 0) -> Iterator[StereoFrame]:
-        for index, frame in enumerate(super().frames(start), start):
-            if index == 8 and any(Path(self.name).parent.glob("*.parts/*.nut")):
+    def frames(video: StereoVideo, start: int = 0) -> Iterator[StereoFrame]:
+        for index, frame in enumerate(read(video, start), start):
+            if index == 8 and any(Path(video.name).parent.glob("*.parts/*.nut")):
                 signal.raise_signal(signal.SIGINT)
             yield frame
+
+    patch.setattr(StereoVideo, "frames", frames)
 
 
 @pytest.mark.parametrize("words", [("--position", "0.4"), ("--layout", "rgbd")])
@@ -185,7 +188,7 @@ def test_an_interrupted_conversion_resumes_with_the_same_frames(tmp_path, monkey
     video = slow_video(tmp_path / "in.mp4")
     assert run(video, tmp_path / "whole.mp4", *words) == 0
     with monkeypatch.context() as patch:
-        patch.setattr("stereoweave.video.reader.StereoVideo", Interrupted)
+        interrupt(patch)
         assert run(video, tmp_path / "broken.mp4", *words) == 130
     [folder] = tmp_path.glob("broken*.parts")
     [line] = [line for line in capsys.readouterr().err.splitlines() if line.startswith("stereoweave")]
@@ -199,6 +202,33 @@ def test_an_interrupted_conversion_resumes_with_the_same_frames(tmp_path, monkey
     [whole], [broken] = tmp_path.glob("whole*"), tmp_path.glob("broken*")
     np.testing.assert_array_equal(frames_of(broken), frames_of(whole))
     assert times_of(broken) == times_of(video)
+
+
+def test_a_resumed_conversion_reports_where_it_goes_on(tmp_path, monkeypatch, capsys):
+    video = slow_video(tmp_path / "in.mp4", 10)
+    with monkeypatch.context() as patch:
+        interrupt(patch)
+        assert run(video, tmp_path / "out.mp4", "--depth") == 130
+    capsys.readouterr()
+    assert run(video, tmp_path / "out.mp4", "--depth") == 0
+    # The first part has five frames of two seconds.
+    assert capsys.readouterr().err.splitlines()[0] == "out.mp4: resuming at 0:00:10"
+
+
+def test_a_preview_is_the_middle_of_a_video(tmp_path, capsys):
+    video = write_side_by_side(
+        tmp_path / "in.mp4", example_pairs(10), times_ms=range(0, 10_000, 1000), codec="libx264", sound=True
+    )
+    assert run(video, tmp_path / "out.mkv", "--depth16", "--preview", "3s") == 0
+    told = capsys.readouterr().out.splitlines()
+    assert told[0] == f"{tmp_path / 'out.mkv'}: 3 frames, 0 cuts"
+    assert told[1].startswith("the whole video takes about ")
+    # The three seconds begin at 3.5 s, and their first frame is the one at 4 s.
+    with av.open(str(tmp_path / "out.mkv")) as container:
+        assert not container.streams.audio
+        grey = next(container.decode(video=0)).to_ndarray()
+    fifth = list(open_video([video]).frames())[4]
+    np.testing.assert_array_equal(grey, np.rint(256 * estimate_of(fifth).disparity_px))
 
 
 def test_an_output_in_use_is_refused_until_its_process_is_killed(tmp_path, capsys):
@@ -226,7 +256,7 @@ def test_an_output_in_use_is_refused_until_its_process_is_killed(tmp_path, capsy
 def test_parts_made_with_other_settings_are_not_resumed(tmp_path, monkeypatch, capsys):
     video = slow_video(tmp_path / "in.mp4", 10)
     with monkeypatch.context() as patch:
-        patch.setattr("stereoweave.video.reader.StereoVideo", Interrupted)
+        interrupt(patch)
         assert run(video, tmp_path / "out.mp4", "--position", "0.4", "--convergence", "3") == 130
     capsys.readouterr()
     assert run(video, tmp_path / "out.mp4", "--position", "0.6") == 2
@@ -238,7 +268,7 @@ def test_parts_made_with_other_settings_are_not_resumed(tmp_path, monkeypatch, c
 
 
 def test_a_full_disk_is_reported_in_one_line_that_says_how_to_resume(tmp_path):
-    video = slow_video(tmp_path / "in.mp4", 45)
+    video = slow_video(tmp_path / "in.mp4", 65)
     assert run(video, tmp_path / "whole.mkv", "--depth16") == 0
     # There is room for each part and for the state after it (0.4 MB), but not for the joined video.
     room_bytes = int(0.8 * (tmp_path / "whole.mkv").stat().st_size)
@@ -255,7 +285,7 @@ def test_a_full_disk_is_reported_in_one_line_that_says_how_to_resume(tmp_path):
         f"finished parts are in {folder}; rerun the same command to resume"
     )
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in.mp4", "out.mkv.parts", "whole.mkv"]
-    assert len(list(folder.glob("*.nut"))) == 9
+    assert len(list(folder.glob("*.nut"))) == 13
     assert run(video, tmp_path / "out.mkv", "--depth16") == 0
     np.testing.assert_array_equal(frames_of(tmp_path / "out.mkv"), frames_of(tmp_path / "whole.mkv"))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in.mp4", "out.mkv", "whole.mkv"]
@@ -298,6 +328,8 @@ def test_a_damaged_frame_is_reported_with_its_time_and_does_not_end_the_video(tm
         ("out.mp4", ["--depth", "--rate", "-5"], "--rate: expected frames per second"),
         ("out.mp4", ["--depth", "--rate", "1e300"], "at most 1000, such as 24 or 30000/1001, found '1e300'"),
         ("out.mp4", ["--depth", "--rate", ""], "--rate: expected frames per second"),
+        ("out.mp4", ["--depth", "--preview", "soon"], "--preview: expected seconds above 0, such as 5s, "),
+        ("out.mp4", ["--depth", "--preview", "0s"], "--preview: expected seconds above 0, such as 5s, "),
     ],
 )
 def test_an_impossible_output_is_refused_in_one_line_before_any_work(tmp_path, capsys, out, words, told):
@@ -412,7 +444,7 @@ def test_a_series_with_a_changed_picture_is_not_resumed(tmp_path, monkeypatch, c
     out = (folder / pattern).with_name("out.mp4")
     words = ["--position", "0.5", "--rate", "0.5"]
     with monkeypatch.context() as patch:
-        patch.setattr("stereoweave.video.reader.StereoVideo", Interrupted)
+        interrupt(patch)
         assert run(folder / pattern, out, *words) == 130
     status = (folder / "006.png").stat()
     os.utime(folder / "006.png", ns=(status.st_atime_ns, status.st_mtime_ns + 1_000_000))
@@ -424,7 +456,7 @@ def test_a_series_with_a_changed_picture_is_not_resumed(tmp_path, monkeypatch, c
 def test_a_conversion_with_another_frame_packing_is_not_resumed(tmp_path, monkeypatch, capsys):
     video = slow_video(tmp_path / "in.mp4", 10)
     with monkeypatch.context() as patch:
-        patch.setattr("stereoweave.video.reader.StereoVideo", Interrupted)
+        interrupt(patch)
         assert run(video, tmp_path / "out.mp4", "--position", "0.5") == 130
     capsys.readouterr()
     assert run(video, tmp_path / "out.mp4", "--position", "0.5", "--format", "crossed") == 2
