@@ -1,8 +1,10 @@
-"""Temporal-filter benchmark on noisy rendered videos: flicker and errors with and without the filter."""
+"""Benchmark of steadiness on noisy rendered videos: flicker and errors of three methods."""
 
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from fractions import Fraction
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,10 +28,14 @@ from stereoweave.matching.providers import CPU
 from stereoweave.rendering.renderer import Renderer
 from stereoweave.stereo import Estimate, StereoPair
 from stereoweave.synth.sets.pair_rendering import RenderSpec
+from stereoweave.system.threads import thread_count
+from stereoweave.video.carried_frames import carry_depth
+from stereoweave.video.frame_groups import MATCHED_EVERY, FrameGroup
+from stereoweave.video.reader import StereoFrame
 from stereoweave.video.temporal_filter import TemporalFilter
 
 MEAN = "mean"
-FRAME_BY_FRAME, STEADY = "frame by frame", "steady"
+FRAME_BY_FRAME, STEADY, CARRIED = "frame by frame", "steady", "carried"
 # Length of the whole camera path: five seconds.
 _PATH_FRAMES = 120
 
@@ -48,7 +54,7 @@ class FlickerRow:
         moving_epe_px: End-point error on the moving object; NaN if there is none.
         uncovered_epe_px: End-point error at points that the previous frame did not show; NaN if there are
             none.
-        time_ms: Median time of the temporal filter per frame; NaN if the filter is not used.
+        time_ms: Mean time per frame of the temporal filter, and of carrying depth; NaN if neither is used.
     """
 
     film: str
@@ -85,7 +91,10 @@ def score_flicker(  # noqa: PLR0913 - each is an option of the command line
     threads: int | None = None,
     provider: str = CPU,
 ) -> Iterator[FlickerRow]:
-    """Yield two rows, without and with the temporal filter, for each of the four videos of each scene.
+    """Yield three rows for each of the four videos of each scene.
+
+    They are without the temporal filter, with it, and with depth carried between matched frames, as in a
+    conversion.
 
     Args:
         scenes: Scene names, as for `stereoweave synth make`.
@@ -152,15 +161,34 @@ def _render_videos(spec: RenderSpec, frames: int) -> Iterator[RenderedVideo]:
 def _run_methods(
     video: RenderedVideo, pairs: list[StereoPair], estimates: list[Estimate], threads: int | None
 ) -> dict[str, _MethodOutput]:
-    temporal_filter, steady, times_ms = TemporalFilter(threads), [], []
-    for pair, estimate in zip(pairs, estimates, strict=True):
-        start_s = time.perf_counter()
-        steady.append(temporal_filter(pair.left, pair.right, estimate))
-        times_ms.append(1000 * (time.perf_counter() - start_s))
+    steady, steady_ms = _steady(_group_frames(pairs, 1), estimates, threads)
+    carried, carried_ms = _steady(_group_frames(pairs, MATCHED_EVERY), estimates, threads)
     return {
         FRAME_BY_FRAME: _MethodOutput(*_render_middle(video, estimates, threads), float("nan")),
-        STEADY: _MethodOutput(*_render_middle(video, steady, threads), float(np.median(times_ms[1:]))),
+        STEADY: _MethodOutput(*_render_middle(video, steady, threads), steady_ms),
+        CARRIED: _MethodOutput(*_render_middle(video, carried, threads), carried_ms),
     }
+
+
+def _group_frames(pairs: list[StereoPair], size: int) -> list[FrameGroup]:
+    """Return groups of a number of frames, after the first frame alone."""
+    frames = [StereoFrame(pair.left, pair.right, Fraction(n), None) for n, pair in enumerate(pairs)]
+    starts = [0, *range(1, len(pairs), size)]
+    return [FrameGroup(frames[start:end], pairs[start:end]) for start, end in pairwise([*starts, len(pairs)])]
+
+
+def _steady(
+    groups: list[FrameGroup], estimates: list[Estimate], threads: int | None
+) -> tuple[list[Estimate], float]:
+    """Return the steady estimates of all frames, and the mean time per frame in milliseconds."""
+    matched = ((group, estimates[int(group.frames[-1].time)]) for group in groups)
+    found, times_ms, start_s = list[Estimate](), list[float](), time.perf_counter()
+    for estimated in carry_depth(matched, TemporalFilter(threads), thread_count(threads)):
+        times_ms.append(1000 * (time.perf_counter() - start_s))
+        start_s = time.perf_counter()
+        found.append(estimated.estimate)
+    # The first frame has no predecessor.
+    return found, float(np.mean(times_ms[1:]))
 
 
 def _render_middle(

@@ -5,9 +5,10 @@ depth to the frames between is three times as fast. A point that one of the two 
 is visible in the other one, so both are asked.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import repeat
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, UInt8
@@ -15,13 +16,40 @@ from jaxtyping import Float32, UInt8
 from stereoweave.matching.left_right_check import find_occluded
 from stereoweave.stereo import Estimate, StereoPair
 from stereoweave.video.carried_kernels import Source, take_pixels
+from stereoweave.video.frame_groups import FrameGroup
 from stereoweave.video.motion import convert_to_grey, find_flow, halve
-from stereoweave.video.temporal_filter import FilteredFrame, Track
+from stereoweave.video.reader import StereoFrame
+from stereoweave.video.temporal_filter import FilteredFrame, TemporalFilter, Track
 
 # A window's pixel weighs less, the more its grey level differs from the centre's, because it may then belong
 # to another surface (K.-J. Yoon and I. S. Kweon, "Adaptive Support-Weight Approach for Correspondence
 # Search", 2006).
 WEIGHTS = np.exp(-np.arange(256) / 10).astype(np.float32)
+
+
+class EstimatedFrame(NamedTuple):
+    """A frame as read, its aligned pair, and the pair's estimate."""
+
+    frame: StereoFrame
+    pair: StereoPair
+    estimate: Estimate
+
+
+def carry_depth(
+    matched: Iterable[tuple[FrameGroup, Estimate]], temporal_filter: TemporalFilter, threads: int
+) -> Iterator[EstimatedFrame]:
+    """Yield all frames of a video with steady estimates.
+
+    Args:
+        matched: Groups of frames, each with the estimate of its last frame.
+        temporal_filter: Filter of the matched frames.
+        threads: Maximum number of threads.
+    """
+    for (frames, pairs), estimate in matched:
+        before, last = temporal_filter.last, pairs[-1]
+        steady = temporal_filter(last.left, last.right, estimate)
+        carried = carry_between(pairs[:-1], before, temporal_filter.last, threads)
+        yield from map(EstimatedFrame, frames, pairs, [*carried, steady])
 
 
 def carry_between(

@@ -3,17 +3,17 @@
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
 from stereoweave.matching.estimate import match
 from stereoweave.matching.matcher import Matcher
 from stereoweave.matching.options import MatchOptions
-from stereoweave.stereo import Estimate, StereoPair
+from stereoweave.stereo import Estimate
 from stereoweave.system.ahead import ahead
 from stereoweave.system.threads import thread_count
-from stereoweave.video.carried_frames import carry_between
+from stereoweave.video.carried_frames import EstimatedFrame, carry_depth
 from stereoweave.video.frame_groups import FrameGroup, FrameGrouper
 from stereoweave.video.job import VideoJob
 from stereoweave.video.reader import StereoFrame, format_time
@@ -54,12 +54,6 @@ class VideoTally:
 def load_matcher(job: VideoJob) -> Matcher:
     """Load a job's network for use beside other steps, which together take longer than the network."""
     return replace(job.backend, threads=max(thread_count(job.backend.threads) - 1, 1)).matcher()
-
-
-class _EstimatedFrame(NamedTuple):
-    frame: StereoFrame
-    pair: StereoPair
-    estimate: Estimate
 
 
 class FrameConverter:
@@ -115,7 +109,7 @@ class FrameConverter:
         """
         groups = self._overlap(self._grouper(frames), _GROUPS_AHEAD)
         matched = self._overlap(map(self._match, groups), _GROUPS_AHEAD)
-        estimated = self._overlap(self._carry(matched), _FRAMES_AHEAD)
+        estimated = self._overlap(carry_depth(matched, self._filter, self._threads), _FRAMES_AHEAD)
         rendered = self._overlap(map(self._render, estimated), _FRAMES_AHEAD)
         for frame, picture in rendered:
             self.tally.add(frame)
@@ -125,15 +119,7 @@ class FrameConverter:
     def _match(self, group: FrameGroup) -> tuple[FrameGroup, Estimate]:
         return group, match(self._matcher, group.pairs[-1], self._options)
 
-    def _carry(self, matched: Iterable[tuple[FrameGroup, Estimate]]) -> Iterator[_EstimatedFrame]:
-        """Yield all frames of the groups with their estimates."""
-        for (frames, pairs), estimate in matched:
-            before, last = self._filter.last, pairs[-1]
-            steady = self._filter(last.left, last.right, estimate)
-            carried = carry_between(pairs[:-1], before, self._filter.last, self._threads)
-            yield from map(_EstimatedFrame, frames, pairs, [*carried, steady])
-
-    def _render(self, estimated: _EstimatedFrame) -> tuple[StereoFrame, Picture]:
+    def _render(self, estimated: EstimatedFrame) -> tuple[StereoFrame, Picture]:
         return estimated.frame, self._job.render_frame(estimated.pair, estimated.estimate, self.survey)
 
     def _overlap(self, items: Iterable[Item], count: int) -> Iterator[Item]:

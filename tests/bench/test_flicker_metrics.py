@@ -3,7 +3,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stereoweave.bench.flicker import FRAME_BY_FRAME, STEADY, FlickerRow, average_rows, score_flicker
+from stereoweave.bench.flicker import (
+    CARRIED,
+    FRAME_BY_FRAME,
+    STEADY,
+    FlickerRow,
+    average_rows,
+    score_flicker,
+)
 from stereoweave.bench.flicker_metrics import find_seen_again, flicker
 from stereoweave.bench.flicker_videos import (
     LEFT,
@@ -197,13 +204,14 @@ def test_a_rendered_pan_looks_the_same_along_its_true_motion():
 @pytest.mark.needs_egl
 def test_the_rows_show_the_effect_of_the_temporal_filter():
     rows = list(score_flicker(["rooms"], frames=4, size_px=(160, 120), seed=3, threads=1))
-    assert [row.film for row in rows[::2]] == ["still", "passing", "nearing", "panning"]
-    assert [row.method for row in rows] == [FRAME_BY_FRAME, STEADY] * 4
-    for by_frame, steady in zip(rows[::2], rows[1::2], strict=True):
-        assert steady.flicker_px < by_frame.flicker_px
+    assert [row.film for row in rows[::3]] == ["still", "passing", "nearing", "panning"]
+    assert [row.method for row in rows] == [FRAME_BY_FRAME, STEADY, CARRIED] * 4
+    for by_frame, steady, carried in zip(rows[::3], rows[1::3], rows[2::3], strict=True):
+        assert carried.flicker_px < steady.flicker_px < by_frame.flicker_px
         assert steady.epe_px < 1.01 * by_frame.epe_px
-        assert steady.time_ms > 0
-    passing_by_frame, passing_steady = rows[2:4]
+        assert carried.epe_px < 1.03 * by_frame.epe_px
+        assert min(steady.time_ms, carried.time_ms) > 0
+    passing_by_frame, passing_steady = rows[3:5]
     assert passing_steady.moving_epe_px <= 1.01 * passing_by_frame.moving_epe_px
     assert np.isnan(rows[0].moving_epe_px) and np.isnan(rows[0].uncovered_epe_px)
 

@@ -13,7 +13,7 @@ from experiments.paper.trials import CLAIMS
 REPOSITORY = Path(__file__).resolve().parents[2]
 RECIPE = REPOSITORY / "recipes" / "weave_small.toml"
 PAPER_RECIPE = REPOSITORY / "recipes" / "paper" / "experiment.toml"
-EXPERIMENTS = "ablations", "first_run", "handheld", "paper", "speed", "stage_costs"
+EXPERIMENTS = "ablations", "first_run", "handheld", "paper", "speed", "stage_costs", "video_speed"
 README = (REPOSITORY / "experiments" / "README.md").read_text(encoding="utf-8")
 
 

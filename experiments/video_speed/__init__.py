@@ -1,0 +1,1 @@
+"""Benchmark of the speed of `stereoweave video`."""
