@@ -34,13 +34,14 @@ SHARED = {"cameras", "matching", "outputs", "pictures", "rendering"}
 # Settings of these subpackages that the page and the service do not offer.
 ABSENT = {
     "page": {
-        *("align", "board", "convergence_px", "crop", "files", "forward", "layout", "left", "listed", "out"),
-        *("position", "provider", "range_px", "raw", "refined", "right", "strength", "up"),
+        *("align", "board", "charuco", "convergence_px", "crop", "files", "forward", "layout", "left"),
+        *("listed", "marker_mm", "out", "position", "provider", "quilt", "range_px", "raw", "refined"),
+        *("right", "square_mm", "strength", "up"),
     },
     "service": {
-        *("align", "board", "convergence_px", "crop", "files", "forward", "layout", "left", "listed"),
-        *("no_rectify", "out", "provider", "raw"),
-        *("right", "up"),
+        *("align", "board", "charuco", "convergence_px", "crop", "files", "forward", "layout", "left"),
+        *("listed", "marker_mm", "model", "no_rectify", "out", "provider", "quilt", "raw"),
+        *("right", "square_mm", "up"),
     },
 }
 

@@ -184,7 +184,7 @@ def measure(  # noqa: PLR0913 - each is an option of the command line
     from stereoweave.matching.backend import Backend
     from stereoweave.matching.estimate import match
     from stereoweave.matching.options import MatchOptions
-    from stereoweave.outputs.measure import CameraError, distance
+    from stereoweave.outputs.measure import CameraError, check_places, distance
     from stereoweave.outputs.point_cloud import require_camera
     from stereoweave.pictures.prepare import prepare
 
@@ -192,6 +192,8 @@ def measure(  # noqa: PLR0913 - each is an option of the command line
     options = MatchOptions(range_px=parse_range_px(range_px), refined=refined)
     prepared = prepare(pictures, make_request(format, calib, focal_px, baseline_m, rectify))
     camera = require_camera(prepared.pair)
+    height, width = prepared.pair.left.shape[:2]
+    check_places((width, height), *places)
     matcher = Backend(model=model, threads=threads, provider=provider).matcher()
     estimate = match(matcher, prepared.pair, options)
     error = CameraError(focal=focal_error_percent / 100, baseline=baseline_error_percent / 100)

@@ -369,7 +369,8 @@ def model_file(model: str | Path) -> Path:
     if name not in shipped_models():
         raise MatcherError(
             f"unknown model {name!r}; expected {', '.join(shipped_models())}, {', '.join(MODES)} or "
-            "the path of an .onnx file"
+            "the path of an .onnx file",
+            setting="model",
         )
     return _weights_folder() / f"{name}.onnx"
 

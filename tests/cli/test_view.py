@@ -181,7 +181,7 @@ def test_cropping_leaves_what_all_views_show(pair, arguments, width_px):
         ),
         ("--layout sweep --strength 3.5 -o v.gif", ["position", "-1 to 2", "strength 3.5"]),
         ("--position 2 --strength 1.5 -o v.png", ["position", "-1 to 2", "2.75"]),
-        ("--strength nan -o v.png", ["--strength", "greater than or equal to 0"]),
+        ("--strength nan -o v.png", ["--strength", "expected at least 0"]),
         ("--strength -1 -o v.png", ["--strength"]),
         ("--layout quilt --position 0.3 -o v.png", ["--position", "single view", "quilt", "--strength"]),
         ("--quilt 5x9 -o v.png", ["--quilt", "--layout quilt", "a single view"]),
