@@ -265,7 +265,8 @@ def choose_layout(path: str | Path, name: str | None) -> str | None:
         return held
     if name == VIEWER:
         raise StereoweaveError(
-            f"{path}: expected the file extension .html for the layout viewer, found {Path(path).suffix!r}"
+            f"{path}: expected the file extension .html for the layout viewer, "
+            f"found {Path(path).suffix or 'none'}"
         )
     if name is None and ending in _MOVING_ENDINGS:
         raise StereoweaveError(

@@ -15,7 +15,7 @@ from stereoweave.arguments import check_kind, check_number
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.arrays import ImageLike, as_rgb
 from stereoweave.matching.exposure import match_exposure, recolour
-from stereoweave.stereo import Estimate, StereoCamera, StereoPair, View, check_fits
+from stereoweave.stereo import Estimate, StereoCamera, StereoPair, View, assume_camera, check_fits
 from stereoweave.system.threads import in_bands, thread_count
 
 if TYPE_CHECKING:
@@ -251,18 +251,13 @@ def _recolour(
 
 
 def _assume_camera(estimate: Estimate) -> StereoCamera:
-    """Return a camera with a horizontal field of view of 53 degrees and a centred principal point.
+    """Return the camera that is assumed if none is known.
 
     Negative disparities mean that the cameras converge; the lowest ones are then taken to be at infinity.
     """
     height, width = estimate.disparity_px.shape
-    return StereoCamera(
-        focal_px=width,
-        baseline_m=1.0,
-        cx_px=(width - 1) / 2,
-        cy_px=(height - 1) / 2,
-        doffs_px=max(0.0, -float(np.percentile(estimate.disparity_px, _FAR_PERCENT))),
-    )
+    doffs_px = max(0.0, -float(np.percentile(estimate.disparity_px, _FAR_PERCENT)))
+    return assume_camera((width, height), doffs_px=doffs_px)
 
 
 def _uncover_background(sides: "Sequence[Side]", right: bool, threads: int) -> HiddenBackground:

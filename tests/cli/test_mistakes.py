@@ -80,7 +80,7 @@ MISTAKES = {
     ".gif, .webp), found .png",
     f"view {PAIR} --layout viewer -o photo.png": "photo.png: expected the file extension .html for the "
     "layout "
-    "viewer, found '.png'",
+    "viewer, found .png",
     f"view {PAIR} --layout quilt --quilt 0x6": "--quilt: expected columns and rows for 2 to 200 views, got "
     "0x6; displays use 5x9, 8x6, 7x7 or 11x6",
     f"view {PAIR} --layout wiggle --position 0.3": "--position: expected only for a single view, found with "
