@@ -246,9 +246,7 @@ def test_a_slow_graphics_processor_draws_coarsely_in_motion_and_sharply_at_rest(
     )
     page = open_page(context, photo)
     width_px = page.evaluate("document.querySelector('#view').width")
-    page.evaluate(
-        "stereoweaveViewer.wander = setInterval(() => stereoweaveViewer.look(Math.random(), 0), 20)"
-    )
+    page.evaluate("window.wander = setInterval(() => stereoweaveViewer.look(Math.random(), 0), 20)")
     wait_until(page, f"document.querySelector('#view').width < {0.7 * width_px}")
     page.evaluate("clearInterval(wander)")
     wait_until(page, f"document.querySelector('#view').width === {width_px}")
