@@ -165,6 +165,15 @@ def test_a_mistake_is_answered_in_one_line_that_says_what_to_do(folder, capfd, c
     assert sorted(folder.rglob("*")) == before
 
 
+@pytest.mark.parametrize(("name", "found"), [("boards", "neither"), ("none", "no such folder")])
+def test_a_folder_without_scenes_may_be_a_dataset(folder, capfd, name, found):
+    assert main(["bench", "pairs", name]) == 2
+    assert capfd.readouterr().err == (
+        f"stereoweave: {folder / name}: expected <scene>/left.png below it, or rendered sets, found {found}; "
+        "if it is a dataset, give its name (--dataset)\n"
+    )
+
+
 def test_an_address_that_no_computer_has_is_not_mended_by_another_port(capfd):
     assert main(["app", "--host", "nowhere.invalid"]) == 2
     assert capfd.readouterr().err.startswith(
