@@ -34,14 +34,14 @@ SHARED = {"cameras", "matching", "outputs", "pictures", "rendering"}
 # Settings of these subpackages that the page and the service do not offer.
 ABSENT = {
     "page": {
-        *("align", "board", "charuco", "convergence_px", "crop", "files", "forward", "layout", "left"),
-        *("listed", "marker_mm", "out", "position", "provider", "quilt", "range_px", "raw", "refined"),
-        *("right", "square_mm", "strength", "up"),
+        *("align", "board", "convergence_px", "crop", "files", "forward", "layout", "left"),
+        *("listed", "out", "position", "provider", "quilt", "range_px", "raw", "refined"),
+        *("right", "strength", "up"),
     },
     "service": {
-        *("align", "board", "charuco", "convergence_px", "crop", "files", "forward", "layout", "left"),
-        *("listed", "marker_mm", "model", "no_rectify", "out", "provider", "quilt", "raw"),
-        *("right", "square_mm", "up"),
+        *("align", "board", "convergence_px", "crop", "files", "forward", "layout", "left"),
+        *("listed", "no_rectify", "out", "provider", "quilt", "raw"),
+        *("right", "up"),
     },
 }
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from stereoweave.cameras.rig import format_size
-from stereoweave.errors import FormatError, Remedy, StereoweaveError
+from stereoweave.errors import FormatError, StereoweaveError
 
 _FEWEST_CORNERS = 8
 # A glance at a board: in a copy of at most this width, for boards of at least this many corners a side, since
@@ -38,26 +38,21 @@ class Board:
         if min(self.columns, self.rows) < 3 or not self.square_m > 0:
             raise StereoweaveError(
                 "expected a board of at least 3x3 with squares larger than 0 mm, "
-                f"found {self.columns}x{self.rows} with squares of {1000 * self.square_m:g} mm",
-                remedy=Remedy("count and measure the board", ("board", "square_mm")),
+                f"found {self.columns}x{self.rows} with squares of {1000 * self.square_m:g} mm"
             )
         if (self.marker_m is None) != (self.dictionary is None):
             raise StereoweaveError(
                 "expected both the dictionary and the size of a ChArUco board's markers, "
-                "found only one of them",
-                remedy=Remedy("give both, or neither for a chessboard", ("charuco", "marker_mm")),
+                "found only one of them"
             )
         if self.marker_m is not None and not 0 < self.marker_m < self.square_m:
             raise StereoweaveError(
                 f"expected markers smaller than the squares ({1000 * self.square_m:g} mm), "
-                f"found markers of {1000 * self.marker_m:g} mm",
-                remedy=Remedy("measure the printed board", ("marker_mm", "square_mm")),
+                f"found markers of {1000 * self.marker_m:g} mm"
             )
         if self.dictionary is not None and not hasattr(cv2.aruco, self.dictionary):
             names = ", ".join(name for name in dir(cv2.aruco) if name.startswith("DICT_"))
-            raise StereoweaveError(
-                f"unknown marker dictionary {self.dictionary}; expected one of {names}", setting="charuco"
-            )
+            raise StereoweaveError(f"unknown marker dictionary {self.dictionary}; expected one of {names}")
 
     def __str__(self) -> str:
         if self.dictionary:

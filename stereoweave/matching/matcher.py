@@ -369,8 +369,7 @@ def model_file(model: str | Path) -> Path:
     if name not in shipped_models():
         raise MatcherError(
             f"unknown model {name!r}; expected {', '.join(shipped_models())}, {', '.join(MODES)} or "
-            "the path of an .onnx file",
-            setting="model",
+            "the path of an .onnx file"
         )
     return _weights_folder() / f"{name}.onnx"
 

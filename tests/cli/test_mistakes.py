@@ -42,8 +42,7 @@ MISTAKES = {
     f"measure {PAIR}": "expected --from (first point: a pixel of the left picture), found none; see "
     "stereoweave measure --help",
     "calibrate boards": "expected --out (calibration file to write, in OpenCV's YAML format), found none; "
-    "see "
-    "stereoweave calibrate --help",
+    "see stereoweave calibrate --help",
     "serve left.png": "expected nothing more, found left.png; see stereoweave serve --help",
     "serve --port 99999": "--port: expected at most 65535, found '99999'; see stereoweave serve --help",
     "synth make ship --pairs 1 -o set --rig 500": "--rig: expected 2 values; see stereoweave synth make "
@@ -54,9 +53,8 @@ MISTAKES = {
     "depth film.mp4": "film.mp4: expected a picture (PNG, JPEG, TIFF or the like), found a video; use "
     "'stereoweave video'",
     "depth photo.heic photo.heic": "photo.heic: expected a picture (PNG, JPEG, TIFF or the like), found "
-    "HEIC, "
-    "the format of spatial photographs, which is unsupported; export it as two JPEG files, or as one JPEG "
-    "file with both views side by side",
+    "HEIC, the format of spatial photographs, which is unsupported; export it as two JPEG files, or as one "
+    "JPEG file with both views side by side",
     "depth small.png right.png": "expected left and right pictures of the same size, found small.png with "
     "300x200 and right.png with 640x480 pixels; crop or rescale one of them",
     "depth --list pairs.txt": "pairs.txt: expected a list of pairs, found no such file",
@@ -66,7 +64,7 @@ MISTAKES = {
     "for the output",
     "demo -o left.png": "left.png: expected a writable folder, found a file; choose another place for the "
     "output",
-    f"depth {PAIR} --model huge": "--model: unknown model 'huge'; expected base, small, best or the path of "
+    f"depth {PAIR} --model huge": "unknown model 'huge'; expected base, small, best or the path of "
     "an .onnx file",
     f"depth {PAIR} --calib calib.txt": f"calib.txt: expected {CALIBRATION}, found no such file",
     f"depth {PAIR} --write mesh": f"--write: expected all or one of {', '.join(FILES)}, found 'mesh'",
@@ -79,8 +77,7 @@ MISTAKES = {
     f"view {PAIR} --layout wiggle -o wiggle.png": "wiggle.png: expected an animation file extension (.mp4, "
     ".gif, .webp), found .png",
     f"view {PAIR} --layout viewer -o photo.png": "photo.png: expected the file extension .html for the "
-    "layout "
-    "viewer, found .png",
+    "layout viewer, found .png",
     f"view {PAIR} --layout quilt --quilt 0x6": "--quilt: expected columns and rows for 2 to 200 views, got "
     "0x6; displays use 5x9, 8x6, 7x7 or 11x6",
     f"view {PAIR} --layout wiggle --position 0.3": "--position: expected only for a single view, found with "
@@ -91,21 +88,18 @@ MISTAKES = {
     "or 1600x1200, at least 32 px per side, found 'big'",
     # Rigs.
     f"check {PAIR} small.png": "expected two pictures, left and right, or one that holds both views, found "
-    "3: "
-    "left.png right.png small.png",
+    "3: left.png right.png small.png",
     f"rectify {PAIR} -o .": "left.png: expected a new file, found one of the inputs; choose another --out",
     "calibrate none -o calib.yml --board 9x6 --square-mm 25": "none: expected a folder with pictures of a "
     "board, found no such folder",
     "calibrate boards -o calib.yml --board 9 --square-mm 25": "--board: expected columns and rows, such as "
     "9x6, found '9'",
     f"{CALIBRATE} 0": "expected a board of at least 3x3 with squares larger than 0 mm, found 9x6 with "
-    "squares "
-    "of 0 mm; count and measure the board (--board, --square-mm)",
+    "squares of 0 mm",
     f"{CALIBRATE} 25 --charuco DICT_5X5_100": "expected both the dictionary and the size of a ChArUco "
-    "board's "
-    "markers, found only one of them; give both, or neither for a chessboard (--charuco, --marker-mm)",
+    "board's markers, found only one of them",
     f"{CALIBRATE} 25 --charuco DICT_5X5_100 --marker-mm 30": "expected markers smaller than the squares (25 "
-    "mm), found markers of 30 mm; measure the printed board (--marker-mm, --square-mm)",
+    "mm), found markers of 30 mm",
     f"{CALIBRATE} 25": "boards: expected pairs of pictures, such as left/01.png and right/01.png or 01_L.png "
     "and 01_R.png, found none among 0 files",
     # Many pairs, services and live pictures.
@@ -119,8 +113,7 @@ MISTAKES = {
     "app --host 192.0.2.1": "--host 192.0.2.1: expected an address of this computer, found another one; "
     "127.0.0.1 accepts this computer only, and 0.0.0.0 any computer that can reach it",
     "app --provider gpu": "--provider: expected one of cpu, cuda, tensorrt, openvino, coreml, directml, "
-    "found "
-    "'gpu'",
+    "found 'gpu'",
     "live film.mkv --no-browser --port 0": f"film.mkv: {LIVE} no such file",
     "live 0 1 2 --no-browser --port 0": "expected one source with both views, or a left and a right source, "
     "found 3: 0 1 2",
@@ -130,8 +123,7 @@ MISTAKES = {
     "640x480, found 'big'",
     "synth make ship --pairs 1 --rig -5 1 -o set": "--rig: focal_px: expected a number above 1e-09, found -5",
     "synth check boards": "boards/set.json: expected the description of a set made by stereoweave synth "
-    "make, "
-    "found no such file",
+    "make, found no such file",
     "train none.toml -o run": "none.toml: expected a recipe in TOML, found no such file",
     "export huge -o huge.onnx": "huge: expected a run's folder, a checkpoint, an .onnx matcher file or a "
     "shipped network (base, small), found none of them",
