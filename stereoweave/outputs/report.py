@@ -45,6 +45,7 @@ _LONGER_SIDE_OF_MAP_PX = 640
 _FARTHEST = 4.0
 _LEAST_MIDDLE_PX = 1.0
 # Largest difference of disparity, per pixel, on one surface of the 3-D view; a larger one is an edge.
+# With 1 px, slanted ground had stripes.
 _STEEPEST = 2.0
 
 
