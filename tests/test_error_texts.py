@@ -73,7 +73,7 @@ ERRORS = {
     "range_px: expected disparities between -64 and 64 px, the width of the pictures, got 70 and 80; omit it "
     "for automatic detection": lambda: sw.estimate(BLACK, BLACK, range_px=(70, 80)),
     "threads: expected a number from 1 to 1024, got 0": lambda: sw.Matcher(threads=0),
-    "position: expected -1.0 to 2.0 (0 is the left camera and 1 the right one), got 3": (
+    "position: expected -1 to 2 (0 is the left camera and 1 the right one), got 3": (
         lambda: sw.synthesize(BLACK, BLACK, 3, threads=1)
     ),
     "expected one kind of output, found none; choose one (depth, depth16, position, layout)": VideoJob,

@@ -1,10 +1,11 @@
+import math
 import re
 
 import numpy as np
 import pytest
 
 from stereoweave.errors import StereoweaveError
-from stereoweave.stereo import Estimate, Sample, StereoCamera, StereoPair, View
+from stereoweave.stereo import Estimate, Sample, StereoCamera, StereoPair, View, assume_camera
 
 CAMERA = {"focal_px": 1000.0, "baseline_m": 0.1, "cx_px": 320.0, "cy_px": 240.0}
 
@@ -151,3 +152,9 @@ def test_a_sample_is_shown_by_the_range_of_what_is_known():
 
     assert shown(disparity_px) == "Sample(4x2, disparity 1.0 to 7.0 px, 75.0 % known, 0.0 % occluded)"
     assert shown(disparity_px * np.nan) == "Sample(4x2, disparity unknown, 0.0 % known, 0.0 % occluded)"
+
+
+def test_the_camera_that_is_assumed_sees_53_degrees_about_its_centre():
+    camera = assume_camera((640, 480))
+    assert 2 * math.degrees(math.atan(640 / 2 / camera.focal_px)) == pytest.approx(53.13, abs=0.01)
+    assert (camera.cx_px, camera.cy_px, camera.doffs_px) == (319.5, 239.5, 0)

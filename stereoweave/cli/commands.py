@@ -104,7 +104,12 @@ class Command(TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the command's arguments, and keep them as they were typed."""
         ctx.meta[_WORDS] = shlex.join([*ctx.command_path.split(), *args])
-        return super().parse_args(ctx, args)
+        try:
+            return super().parse_args(ctx, args)
+        except typer.TyperException as error:
+            # An option without its value comes without the context that names the command.
+            error.ctx = getattr(error, "ctx", None) or ctx  # type: ignore[attr-defined]
+            raise
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command. Error messages refer to settings by the names of its options."""

@@ -38,9 +38,6 @@ from stereoweave.cli.options import (
 if TYPE_CHECKING:
     from stereoweave.outputs.report import Summary
 
-# Of what is farther, no rig measures the depth; a disparity slightly above 0 would give 367,134 m.
-_FARTHEST_M = 10_000
-
 Write = Annotated[
     list[str] | None,
     typer.Option(
@@ -184,7 +181,7 @@ def measure(  # noqa: PLR0913 - each is an option of the command line
     from stereoweave.matching.backend import Backend
     from stereoweave.matching.estimate import match
     from stereoweave.matching.options import MatchOptions
-    from stereoweave.outputs.measure import CameraError, distance
+    from stereoweave.outputs.measure import CameraError, check_places, distance
     from stereoweave.outputs.point_cloud import require_camera
     from stereoweave.pictures.prepare import prepare
 
@@ -192,6 +189,8 @@ def measure(  # noqa: PLR0913 - each is an option of the command line
     options = MatchOptions(range_px=parse_range_px(range_px), refined=refined)
     prepared = prepare(pictures, make_request(format, calib, focal_px, baseline_m, rectify))
     camera = require_camera(prepared.pair)
+    height, width = prepared.pair.left.shape[:2]
+    check_places((width, height), *places)
     matcher = Backend(model=model, threads=threads, provider=provider).matcher()
     estimate = match(matcher, prepared.pair, options)
     error = CameraError(focal=focal_error_percent / 100, baseline=baseline_error_percent / 100)
@@ -215,25 +214,18 @@ def _print_json(summary: "Summary", notes: list[str], out: Path) -> None:
 
 
 def _print_summary(summary: "Summary", notes: list[str], out: Path) -> None:
+    from stereoweave.outputs.metres import format_metres
+
     size = f"{summary.width_px}x{summary.height_px} px"
-    typer.echo(
-        f"{' + '.join(summary.pictures)}: {size}, matched by {summary.model} in {summary.estimate_ms:.0f} ms"
-    )
+    matched = f"matched by the model {summary.model} in {summary.estimate_ms:.0f} ms"
+    typer.echo(f"{' + '.join(summary.pictures)}: {size}, {matched}")
     ranges = [f"disparity {summary.disparity_p1_px:.1f} to {summary.disparity_p99_px:.1f} px"]
     if summary.camera and summary.depth_p1_m is None:
         ranges.append("depth infinite")
     elif summary.camera:
-        ranges.append(f"depth {_format_m(summary.depth_p1_m)} to {_format_m(summary.depth_p99_m)}")
+        ranges.append(f"depth {format_metres(summary.depth_p1_m)} to {format_metres(summary.depth_p99_m)}")
     typer.echo(f"{', '.join(ranges)} (98 % of the pixels)")
     for note in notes:
         typer.echo(note)
     typer.echo(f"files: {', '.join(_list_files(out))}")
     typer.echo(f"report: {out / 'report.html'}")
-
-
-def _format_m(depth_m: float | None) -> str:
-    if depth_m is None:
-        return "infinity"
-    if depth_m > _FARTHEST_M:
-        return f"over {_FARTHEST_M / 1000:g} km"
-    return f"{depth_m:#.3g} m" if depth_m < 99.95 else f"{depth_m:.0f} m"

@@ -1,5 +1,6 @@
 """Options that several commands share, their parsing, and sockets."""
 
+import errno
 import math
 import re
 import socket
@@ -224,6 +225,11 @@ def listen(host: str, port: int) -> socket.socket:
         family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         return socket.create_server(address[:2], family=family)
     except OSError as error:
+        if isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL:
+            raise StereoweaveError(
+                f"--host {host}: expected an address of this computer, found another one; 127.0.0.1 accepts "
+                "this computer only, and 0.0.0.0 any computer that can reach it"
+            ) from error
         # create_server appends the address to the system's text.
         found = reason(error).partition(" (while attempting")[0]
         raise StereoweaveError(

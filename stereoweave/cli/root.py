@@ -1,10 +1,8 @@
 """The command line `stereoweave`: its commands, exit codes and one-line errors."""
 
 import io
-import re
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -17,6 +15,7 @@ from stereoweave.cli.commands import Commands
 from stereoweave.cli.demo import demo
 from stereoweave.cli.depth import depth, measure
 from stereoweave.cli.live import live
+from stereoweave.cli.misuse import describe_misuse
 from stereoweave.cli.rig import calibrate, check, rectify
 from stereoweave.cli.serve import serve
 from stereoweave.cli.synth import synth
@@ -24,9 +23,6 @@ from stereoweave.cli.train import export, train
 from stereoweave.cli.video import video
 from stereoweave.cli.view import view
 from stereoweave.errors import StereoweaveError
-
-# Of no use to someone who has typed a word in place of a number.
-_UNPARSED = re.compile(", unable to parse string as an? [a-z]+")
 
 app = Commands("Compute depth, and views from between or beyond the cameras, from a stereo pair.")
 app.add_typer(bench, name="bench")
@@ -48,28 +44,11 @@ def run(commands: Commands, program: str, arguments: Sequence[str] | None) -> in
         words = sys.argv[1:] if arguments is None else arguments
         # A program of one command has no name of a command before its arguments.
         command = words[0] if words and len(commands.registered_commands) > 1 else None
-        message = _describe_misuse(error, program, command)
+        message = describe_misuse(error, program, command)
     except (StereoweaveError, OSError) as error:
         message = str(error)
     typer.echo(f"{program}: " + " ".join(message.splitlines()), err=True)
     return 2
-
-
-def _describe_misuse(error: typer.TyperException, program: str, command: str | None) -> str:
-    """Return an error of the command line's own grammar, with the help to read.
-
-    `command` is the word in the place of a command, if any.
-    """
-    context = getattr(error, "ctx", None)
-    # The context's own name of the program is that of the file that runs.
-    names = [program]
-    while context is not None and context.parent is not None:
-        names.insert(1, str(context.info_name))
-        context = context.parent
-    message = _UNPARSED.sub("", error.format_message().rstrip(".")).replace("Input should be", "expected")
-    if len(names) == 1 and command and Path(command).exists():
-        message = f"expected a command, such as depth or view, before the pictures, found {command}"
-    return f"{message}; see {' '.join(names)} --help"
 
 
 def _show_version(wanted: bool) -> bool:

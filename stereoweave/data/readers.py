@@ -12,7 +12,7 @@ from stereoweave.cameras.calibration_files import add_camera
 from stereoweave.data import eth3d, kitti, middlebury, paper_layout, scene_flow, shards, sintel
 from stereoweave.data.frames import Frame, require_folder
 from stereoweave.data.splits import split_frames
-from stereoweave.errors import FormatError, StereoweaveError
+from stereoweave.errors import FormatError, Remedy, StereoweaveError
 from stereoweave.io.images import read_pair
 from stereoweave.io.maps import read_disparity_png, read_pfm
 from stereoweave.stereo import StereoPair
@@ -98,9 +98,10 @@ def list_scenes(folder: str | Path, dataset: str | None = None) -> list[Callable
         return [partial(_read_scene, scene) for scene in scenes]
     frames = shards.list_frames(Path(folder))
     if not frames:
+        found = "neither" if Path(folder).exists() else "no such folder"
         raise StereoweaveError(
-            f"{folder}: expected <scene>/left.png below it, or rendered sets, found neither; "
-            "if it is a dataset, give its name"
+            f"{folder}: expected <scene>/left.png below it, or rendered sets, found {found}",
+            remedy=Remedy("if it is a dataset, give its name", ("dataset",)),
         )
     return [partial(_read_frame, frame) for frame in frames]
 

@@ -48,7 +48,8 @@ def check_animation_ending(path: str | Path) -> str:
     ending = Path(path).suffix.lower()
     if ending not in _KINDS:
         raise StereoweaveError(
-            f"{path}: expected an animation file extension ({', '.join(_KINDS)}), found {Path(path).suffix!r}"
+            f"{path}: expected an animation file extension ({', '.join(_KINDS)}), "
+            f"found {Path(path).suffix or 'none'}"
         )
     if ending == ".mp4":
         with require_video_extra("an MP4 file"):

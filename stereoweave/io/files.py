@@ -8,12 +8,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from uuid import uuid4
 
-from stereoweave.errors import FormatError, StereoweaveError, reason
+from stereoweave.errors import FormatError, Remedy, StereoweaveError, reason
 
 # Real calibrations and training recipes have a few kilobytes.
 MOST_SMALL_BYTES = 256 * 1024
 # Names of the temporary files of `replacing`.
 _TEMPORARY = re.compile(r"\..*-[0-9a-f]{8}(\.\w+)?")
+_ANOTHER = Remedy("choose another place for the output")
 # Errors that libraries raise for damaged files, such as OverflowError for infinite sizes and RuntimeError (as
 # RecursionError) for deeply nested JSON.
 _UNREADABLE = OSError, ValueError, OverflowError, SyntaxError, RuntimeError
@@ -48,7 +49,9 @@ def make_folder(path: str | Path) -> Path:
         with tempfile.TemporaryFile(dir=folder):
             return folder
     except OSError as error:
-        raise StereoweaveError(f"{path}: expected a writable folder, found {reason(error)}") from error
+        raise StereoweaveError(
+            f"{path}: expected a writable folder, found {reason(error)}", remedy=_ANOTHER
+        ) from error
 
 
 def make_parent_folder(*files: Path) -> Path:
@@ -59,7 +62,7 @@ def make_parent_folder(*files: Path) -> Path:
     """
     for file in files:
         if file.is_dir():
-            raise StereoweaveError(f"{file}: expected a writable file, found a folder")
+            raise StereoweaveError(f"{file}: expected a writable file, found a folder", remedy=_ANOTHER)
     # A dangling link counts as existing, because no folder can be created in its place.
     return make_folder(next(path for path in files[0].parents if path.exists() or path.is_symlink()))
 

@@ -88,7 +88,7 @@ def picture_kind(path: str | Path) -> str:
     ending = Path(path).suffix
     if ending.lower() not in _KINDS:
         raise StereoweaveError(
-            f"{path}: expected a picture file extension ({', '.join(_KINDS)}), found {ending!r}"
+            f"{path}: expected a picture file extension ({', '.join(_KINDS)}), found {ending or 'none'}"
         )
     return _KINDS[ending.lower()]
 

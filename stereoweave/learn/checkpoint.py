@@ -146,6 +146,9 @@ def save(checkpoint: Checkpoint, path: Path) -> None:
     temporary.replace(path)
 
 
+_NOT_ONE = "another kind of file, or a damaged one"
+
+
 def load(path: Path) -> Checkpoint:
     """Load a checkpoint onto the CPU. Raises FormatError if the file is missing or not a checkpoint."""
     try:
@@ -155,9 +158,9 @@ def load(path: Path) -> Checkpoint:
             f"{path}: no such checkpoint; `stereoweave train` writes last.pt into the run's folder"
         ) from error
     except Exception as error:  # PyTorch's reader raises any type of error on invalid bytes
-        raise FormatError(
-            f"{path}: expected a checkpoint of `stereoweave train`, found {reason(error)}"
-        ) from error
+        # Its texts advise programmers.
+        found = reason(error) if isinstance(error, OSError | EOFError) else _NOT_ONE
+        raise FormatError(f"{path}: expected a checkpoint of `stereoweave train`, found {found}") from error
     # Older checkpoints have no origin.
     if not isinstance(values, dict) or {*values, "origin"} != {field.name for field in fields(Checkpoint)}:
         raise FormatError(

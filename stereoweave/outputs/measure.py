@@ -89,8 +89,8 @@ def distance(
         StereoweaveError: A pixel is outside the image, its depth is unknown or infinite, or the two pixels
             are the same.
     """
-    if tuple(first_px) == tuple(second_px):
-        raise StereoweaveError(f"expected two different pixels, found {_format_pixel(first_px)} twice")
+    height, width = estimate.disparity_px.shape
+    check_places((width, height), first_px, second_px)
     (first, first_error), (second, second_error) = (
         _find_point_m(estimate, camera, pixel) for pixel in (first_px, second_px)
     )
@@ -109,6 +109,19 @@ def distance(
         first_m=tuple(first.tolist()),
         second_m=tuple(second.tolist()),
     )
+
+
+def check_places(size_px: tuple[int, int], first_px: tuple[int, int], second_px: tuple[int, int]) -> None:
+    """Raise a StereoweaveError if the pixels are the same, or one is outside the image."""
+    if tuple(first_px) == tuple(second_px):
+        raise StereoweaveError(f"expected two different pixels, found {_format_pixel(first_px)} twice")
+    width, height = size_px
+    for column, row in (first_px, second_px):
+        if not (0 <= column < width and 0 <= row < height):
+            raise StereoweaveError(
+                f"expected a pixel of the left picture, from 0,0 to {width - 1},{height - 1}, "
+                f"found {_format_pixel((column, row))}"
+            )
 
 
 def disparity_error_px(confidence: float) -> float:
@@ -142,15 +155,9 @@ def _check_pixel(estimate: Estimate, pixel_px: tuple[int, int]) -> tuple[int, in
     """Check that a pixel can be measured, and return its column and row.
 
     Raises:
-        StereoweaveError: The pixel is outside the image, is occluded or has a low confidence.
+        StereoweaveError: The pixel is occluded or has a low confidence.
     """
-    height, width = estimate.disparity_px.shape
     column, row = pixel_px
-    if not (0 <= column < width and 0 <= row < height):
-        raise StereoweaveError(
-            f"expected a pixel of the left picture, from 0,0 to {width - 1},{height - 1}, "
-            f"found {_format_pixel(pixel_px)}"
-        )
     if estimate.occluded[row, column]:
         raise StereoweaveError(
             f"pixel {_format_pixel(pixel_px)}: expected a pixel that both cameras see, found an occluded "

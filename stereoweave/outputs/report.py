@@ -21,6 +21,7 @@ from stereoweave.io.colormap import (
 )
 from stereoweave.io.maps import find_scale, format_scale
 from stereoweave.io.text import writing_text
+from stereoweave.outputs.metres import format_metres
 from stereoweave.outputs.report_parts import (
     download_list,
     fill_template,
@@ -33,7 +34,7 @@ from stereoweave.outputs.report_parts import (
 from stereoweave.outputs.viewer_scene import pack_scene
 from stereoweave.rendering.layouts import LAYOUTS, LayoutOptions, median_disparity_px, render_views
 from stereoweave.rendering.renderer import Renderer
-from stereoweave.stereo import Estimate, StereoCamera, StereoPair
+from stereoweave.stereo import Estimate, StereoCamera, StereoPair, assume_camera
 
 # Views for browsers without WebGL; others show the view from any position.
 POSITIONS = (0.0, 0.25, 0.5, 0.75, 1.0)
@@ -44,9 +45,15 @@ _LONGER_SIDE_OF_MAP_PX = 640
 _FARTHEST = 4.0
 _LEAST_MIDDLE_PX = 1.0
 # Largest difference of disparity, per pixel, on one surface of the 3-D view; a larger one is an edge.
-_STEEPEST = 1.0
-# Beyond it, the disparity says no more than "far".
-_FAR_M = 10_000
+# With 1 px, slanted ground had stripes.
+_STEEPEST = 2.0
+
+
+_DISPARITY = " The disparity is how many pixels apart the two pictures show a point."
+_NO_METRES = (
+    '<p class="note">For depth in metres, give a calibration, or the focal length and baseline of the '
+    "cameras.</p>"
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -184,14 +191,16 @@ def _collect_fields(
     size = f"{summary.width_px} × {summary.height_px} px"
     return {
         "title": html.escape(" + ".join(summary.pictures)),
-        "subtitle": html.escape(f"{size}, matched by {summary.model} in {_format_time(summary)}"),
+        "subtitle": html.escape(f"{size}, matched by the model {summary.model} in {_format_time(summary)}"),
         "banner": list_box("banner", "Warnings", context.warnings),
         "notes": list_box("card notes", "Notes", context.notes),
         "width": width,
         "height": height,
         **views.fields,
         "numbers": term_list(_list_numbers(summary)),
+        "metres": "" if pair.camera else _NO_METRES,
         "depth_name": "Depth" if pair.camera else "Disparity",
+        "meaning": "" if pair.camera else _DISPARITY,
         "depth": jpeg_uri(depth),
         "confidence": jpeg_uri(colour_confidence(small_estimate.confidence, small_estimate.occluded)),
         "ramp": ",".join(legend_colours(24)),
@@ -285,21 +294,15 @@ def _place_scene(pair: StereoPair, estimate: Estimate) -> dict[str, float]:
 
     The view turns about the distance `middle`, that of the disparity halfway between the least and the
     greatest one, outliers aside. What is farther than `farthest` is shown there. Without a camera, or with
-    one for which the middle is infinitely far, one with a field of view of 53 degrees is assumed, and the
-    least disparity is taken to be at infinity.
+    one for which the middle is infinitely far, one is assumed (`stereo.assume_camera`), and the least
+    disparity is taken to be at infinity.
     """
     least_px, greatest_px = np.percentile(estimate.disparity_px[_seen(pair)], [1, 99]).tolist()
     halfway_px = (least_px + greatest_px) / 2
     height, width = estimate.disparity_px.shape
     camera = pair.camera
     if camera is None or halfway_px + camera.doffs_px < _LEAST_MIDDLE_PX:
-        camera = StereoCamera(
-            focal_px=width,
-            baseline_m=1,
-            cx_px=(width - 1) / 2,
-            cy_px=(height - 1) / 2,
-            doffs_px=max(0.0, -least_px, _LEAST_MIDDLE_PX - halfway_px),
-        )
+        camera = assume_camera((width, height), doffs_px=max(0.0, -least_px, _LEAST_MIDDLE_PX - halfway_px))
     middle_px = halfway_px + camera.doffs_px
     return {
         "focal_px": camera.focal_px,
@@ -332,9 +335,9 @@ def _list_numbers(summary: Summary) -> list[tuple[str, str]]:
         rows += [
             (
                 "Depth (98 % of the pixels)",
-                f"{_format_metres(summary.depth_p1_m)} to {_format_metres(summary.depth_p99_m)}",
+                f"{format_metres(summary.depth_p1_m)} to {format_metres(summary.depth_p99_m)}",
             ),
-            ("Median depth", _format_metres(summary.depth_median_m)),
+            ("Median depth", format_metres(summary.depth_median_m)),
             ("Focal length", f"{summary.camera.focal_px:.1f} px"),
             ("Baseline", f"{summary.camera.baseline_m * 1000:.1f} mm"),
             ("Left principal point", f"{summary.camera.cx_px:.1f}, {summary.camera.cy_px:.1f} px"),
@@ -342,8 +345,8 @@ def _list_numbers(summary: Summary) -> list[tuple[str, str]]:
         ]
     return [
         *rows,
-        ("Confident (at least 50 %)", f"{summary.confident_percent:.1f} %"),
-        ("Occluded", f"{summary.occluded_percent:.1f} %"),
+        ("Pixels with a confidence of at least 50 %", f"{summary.confident_percent:.1f} %"),
+        ("Occluded: seen by the left camera only", f"{summary.occluded_percent:.1f} %"),
     ]
 
 
@@ -366,7 +369,7 @@ def _label_ticks(range_px: tuple[float, float], camera: StereoCamera | None) -> 
     values_px = np.linspace(*range_px, 5)
     if camera is None:
         return [f"{value_px:.1f} px" for value_px in values_px]
-    return [_format_metres(_depth_m(camera, value_px)) for value_px in values_px]
+    return [format_metres(_depth_m(camera, value_px)) for value_px in values_px]
 
 
 def _depth_m(camera: StereoCamera | None, disparity_px: float) -> float | None:
@@ -375,14 +378,6 @@ def _depth_m(camera: StereoCamera | None, disparity_px: float) -> float | None:
         return None
     depth_m = float(camera.depth_m(np.array([[disparity_px]], np.float64))[0, 0])
     return _round(depth_m) if np.isfinite(depth_m) else None
-
-
-def _format_metres(depth_m: float | None) -> str:
-    if depth_m is None:
-        return "∞"
-    if depth_m >= _FAR_M:
-        return "> 10 km"
-    return f"{depth_m:#.3g} m" if depth_m < 99.95 else f"{depth_m:.0f} m"
 
 
 def _format_time(summary: Summary) -> str:

@@ -22,7 +22,7 @@ from stereoweave.outputs.viewer import viewer_script
 CONTENTS = {
     "disparity.pfm": "disparity in pixels, float32",
     "disparity.png": "disparity, pixels × 256, 16 bits",
-    "disparity_scaled.png": "disparity with the scale and offset above, 16 bits",
+    "disparity_scaled.png": "disparity, 16 bits; its text chunks hold scale and offset",
     "disparity.npy": "disparity in pixels, for NumPy",
     "disparity.tiff": "disparity in pixels, float32",
     "depth.png": "depth in millimetres, 16 bits",
@@ -32,10 +32,10 @@ CONTENTS = {
     "preview.png": "disparity in colour, full size",
     "confidence.png": "confidence, black is 0, white is 1",
     "occluded.png": "white where only the left camera sees",
-    "cloud.ply": "point cloud in metres",
-    "cloud.glb": "point cloud in metres",
-    "mesh.ply": "mesh in metres",
-    "mesh.glb": "mesh in metres",
+    "cloud.ply": "point cloud in metres, for CloudCompare or MeshLab",
+    "cloud.glb": "point cloud in metres, for Blender",
+    "mesh.ply": "mesh in metres, for MeshLab",
+    "mesh.glb": "mesh in metres, for Blender and 3-D viewers",
 }
 
 _QUALITY = 88

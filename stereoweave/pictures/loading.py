@@ -3,6 +3,7 @@
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -93,8 +94,17 @@ def open_pictures(paths: Sequence[Path], format: str | None = None) -> Opened:
     names = " ".join(map(str, paths))
     raise StereoweaveError(
         f"expected two pictures, left and right, or one that holds both views, found {len(paths)}: {names}",
-        remedy=Remedy("if one of them is the output, name it as such", ("out",)) if paths else None,
+        remedy=_advise_on_count(paths),
     )
+
+
+def _advise_on_count(paths: Sequence[Path]) -> Remedy | None:
+    """Return the remedy for another number of pictures than one or two."""
+    for first, second in pairwise(map(str, paths)):
+        # A shell splits an unquoted name at its spaces.
+        if Path(f"{first} {second}").is_file():
+            return Remedy(f"put quotes around a name with spaces: '{first} {second}'")
+    return Remedy("if one of them is the output, name it as such", ("out",)) if paths else None
 
 
 def pixel_factor(path: Path, picture: Image.Image, format: str | None) -> int:

@@ -20,7 +20,7 @@ from stereoweave.io.animation import check_animation_ending
 from stereoweave.io.colormap import find_colour_range_px
 from stereoweave.io.files import replacing
 from stereoweave.io.images import checking_format_size, picture_kind, write_image
-from stereoweave.rendering.renderer import FIRST_POSITION, LAST_POSITION, Renderer
+from stereoweave.rendering.renderer import Renderer, check_position
 from stereoweave.stereo import Estimate, StereoPair
 
 # Viewers of a quilt move their heads much farther than the cameras are apart, so a quilt needs a wide range
@@ -77,8 +77,9 @@ class LayoutOptions:
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < 1 or not 2 <= self.columns * self.rows <= _MOST_VIEWS:
             raise StereoweaveError(
-                f"quilt: expected columns and rows for 2 to {_MOST_VIEWS} views, "
-                f"got {self.columns}x{self.rows}; displays use 5x9, 8x6, 7x7 or 11x6"
+                f"expected columns and rows for 2 to {_MOST_VIEWS} views, "
+                f"got {self.columns}x{self.rows}; displays use 5x9, 8x6, 7x7 or 11x6",
+                setting="quilt",
             )
         if self.range_px is not None and not -math.inf < self.range_px[0] < self.range_px[1] < math.inf:
             raise StereoweaveError(
@@ -264,7 +265,8 @@ def choose_layout(path: str | Path, name: str | None) -> str | None:
         return held
     if name == VIEWER:
         raise StereoweaveError(
-            f"{path}: expected the file extension .html for the layout viewer, found {Path(path).suffix!r}"
+            f"{path}: expected the file extension .html for the layout viewer, "
+            f"found {Path(path).suffix or 'none'}"
         )
     if name is None and ending in _MOVING_ENDINGS:
         raise StereoweaveError(
@@ -281,14 +283,7 @@ def choose_layout(path: str | Path, name: str | None) -> str | None:
 def check_positions(positions: Iterable[float], strength: float) -> None:
     """Raise a StereoweaveError if a view cannot be rendered from one of these positions at this strength."""
     for position in positions:
-        seen_from = 0.5 + strength * (position - 0.5)
-        if not FIRST_POSITION <= seen_from <= LAST_POSITION:
-            by_strength = "" if strength == 1 else f" (position {position:g} at strength {strength:g})"
-            raise StereoweaveError(
-                f"expected {FIRST_POSITION:g} to {LAST_POSITION:g} (0 is the left camera and 1 the right "
-                f"one), got {seen_from:g}{by_strength}",
-                setting="position",
-            )
+        check_position(position, strength=strength)
 
 
 def median_disparity_px(estimate: Estimate) -> float:

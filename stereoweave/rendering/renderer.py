@@ -15,7 +15,7 @@ from stereoweave.arguments import check_kind, check_number
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.arrays import ImageLike, as_rgb
 from stereoweave.matching.exposure import match_exposure, recolour
-from stereoweave.stereo import Estimate, StereoCamera, StereoPair, View, check_fits
+from stereoweave.stereo import Estimate, StereoCamera, StereoPair, View, assume_camera, check_fits
 from stereoweave.system.threads import in_bands, thread_count
 
 if TYPE_CHECKING:
@@ -78,9 +78,7 @@ class Renderer:
             up: Distance above the line through the cameras, in baselines; from -1 to 1.
             forward: Distance from that line towards the scene, in baselines; from -1 to 1.
         """
-        check_number("position", position)
-        position = 0.5 + self.strength * (position - 0.5)
-        check_position(position, up=up, forward=forward)
+        position = check_position(position, strength=self.strength, up=up, forward=forward)
         moves = bool(self.convergence_px or up or forward)
         if position in (0, 1) and not moves:
             image = self.pair.right if position else self.pair.left
@@ -191,14 +189,16 @@ def render(  # noqa: PLR0913 - the options of one view
     return renderer.view(position, up=up, forward=forward)
 
 
-def check_position(position: float, *, up: float = 0.0, forward: float = 0.0) -> None:
-    """Raise a ValueError if no view can be rendered from this position."""
+def check_position(position: float, *, strength: float = 1.0, up: float = 0.0, forward: float = 0.0) -> float:
+    """Return the position at this strength; raise a StereoweaveError if no view can be seen from there."""
     for name, value in (("position", position), ("up", up), ("forward", forward)):
         check_number(name, value)
-    if not FIRST_POSITION <= position <= LAST_POSITION:
+    seen_from = 0.5 + strength * (position - 0.5)
+    if not FIRST_POSITION <= seen_from <= LAST_POSITION:
+        by_strength = "" if strength == 1 else f" (position {position:g} at strength {strength:g})"
         raise StereoweaveError(
-            f"expected {FIRST_POSITION} to {LAST_POSITION} (0 is the left camera and 1 the right one), "
-            f"got {position}",
+            f"expected {FIRST_POSITION:g} to {LAST_POSITION:g} (0 is the left camera and 1 the right one), "
+            f"got {seen_from:g}{by_strength}",
             setting="position",
         )
     for name, value in (("up", up), ("forward", forward)):
@@ -206,6 +206,7 @@ def check_position(position: float, *, up: float = 0.0, forward: float = 0.0) ->
             raise StereoweaveError(
                 f"expected -{_FARTHEST_MOVE:g} to {_FARTHEST_MOVE:g} baselines, got {value}", setting=name
             )
+    return seen_from
 
 
 def _check_shifts(strength: float, convergence_px: float, pair: StereoPair) -> None:
@@ -250,18 +251,13 @@ def _recolour(
 
 
 def _assume_camera(estimate: Estimate) -> StereoCamera:
-    """Return a camera with a horizontal field of view of 53 degrees and a centred principal point.
+    """Return the camera that is assumed if none is known.
 
     Negative disparities mean that the cameras converge; the lowest ones are then taken to be at infinity.
     """
     height, width = estimate.disparity_px.shape
-    return StereoCamera(
-        focal_px=width,
-        baseline_m=1.0,
-        cx_px=(width - 1) / 2,
-        cy_px=(height - 1) / 2,
-        doffs_px=max(0.0, -float(np.percentile(estimate.disparity_px, _FAR_PERCENT))),
-    )
+    doffs_px = max(0.0, -float(np.percentile(estimate.disparity_px, _FAR_PERCENT)))
+    return assume_camera((width, height), doffs_px=doffs_px)
 
 
 def _uncover_background(sides: "Sequence[Side]", right: bool, threads: int) -> HiddenBackground:

@@ -82,7 +82,7 @@ class ServiceJob:
 
     def __post_init__(self) -> None:
         if self.is_view:
-            check_position(0.5 + self.strength * (self.position - 0.5))
+            check_position(self.position, strength=self.strength)
 
     @property
     def is_view(self) -> bool:

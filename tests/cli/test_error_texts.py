@@ -78,16 +78,16 @@ ERRORS = {
     "give another file",
     f"depth {PAIR} --focal-px 500 --baseline-m 0": "--baseline-m: expected a number above 1e-09, found 0",
     f"depth {PAIR} --focal-px -500 --baseline-m 1": "--focal-px: expected a number above 1e-09, found -500",
-    f"depth {PAIR} --focal-px 5mm": "Invalid value for '--focal-px': expected a valid number; see "
-    "stereoweave depth --help",
-    f"depth {PAIR} --threads many": "Invalid value for '--threads': expected a valid integer; see "
-    "stereoweave depth --help",
+    f"depth {PAIR} --focal-px 5mm": "--focal-px: expected a number, found '5mm'; see stereoweave depth "
+    "--help",
+    f"depth {PAIR} --threads many": "--threads: expected a whole number, found 'many'; see stereoweave "
+    "depth --help",
     f"view {PAIR} -o out.gif": "out.gif: expected an animation for this extension, found a single view; "
     "choose sweep or wiggle (--layout)",
     f"{PAIR}": "expected a command, such as depth or view, before the pictures, found left.png; see "
     "stereoweave --help",
-    "bench pair scenes": "No such command 'pair'. Did you mean 'pairs', 'parity'?; see stereoweave "
-    "bench --help",
+    "bench pair scenes": "no such command 'pair'; did you mean 'pairs', 'parity'? See stereoweave bench "
+    "--help",
     "batch . out --gpus-each 1.5": (
         "--gpus-each: expected 0, a fraction below 1, or a whole number, found 1.5"
     ),

@@ -548,7 +548,7 @@ def test_a_broken_link_is_refused_as_an_output(tmp_path, capsys, line):
     places = {"left": TEXTURED / "left.png", "right": TEXTURED / "right.png", "folder": TEXTURED}
     assert run(line.format(**places, link=link)) == 2
     told = capsys.readouterr().err.splitlines()
-    expected = "expected a writable folder, found a broken link"
+    expected = "expected a writable folder, found a broken link; choose another place for the output"
     assert told[-1] == f"stereoweave: {link}: {expected}"
     assert not (tmp_path / "nowhere").exists()
 

@@ -112,10 +112,10 @@ def test_the_costs_of_the_effects_are_printed_in_milliseconds(monkeypatch, capsy
     ("line", "words"),
     [
         ("synth make cathedral --pairs 1 -o set", "scene: expected one of "),
-        ("synth make pylon --pairs 0 -o set", "greater than or equal to 1"),
-        ("synth make pylon --pairs -5 -o set", "greater than or equal to 1"),
-        ("synth make pylon --pairs 1 --seed -1 -o set", "greater than or equal to 0"),
-        ("synth make pylon --pairs 1 --frames 0 -o set", "greater than or equal to 1"),
+        ("synth make pylon --pairs 0 -o set", "expected at least 1"),
+        ("synth make pylon --pairs -5 -o set", "expected at least 1"),
+        ("synth make pylon --pairs 1 --seed -1 -o set", "expected at least 0"),
+        ("synth make pylon --pairs 1 --frames 0 -o set", "expected at least 1"),
         ("synth make pylon --pairs 1 --size 640 -o set", "--size: expected width x height"),
         (
             "synth make pylon --pairs 1 --size 640x10 -o set",

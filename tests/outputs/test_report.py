@@ -174,6 +174,16 @@ def test_the_legend_is_in_metres_with_a_camera_and_in_pixels_without(rng, tmp_pa
         assert legend in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
+def test_the_report_says_what_a_disparity_is_and_how_to_get_metres_only_without_a_camera(rng, tmp_path):
+    photograph = texture(rng, 60, 132)
+    texts = "how many pixels apart the two pictures show a point", "For depth in metres, give a calibration"
+    for camera in (CAMERA, None):
+        pair, estimate = wall(photograph, SHIFT_PX, camera)
+        write_report(tmp_path / "report.html", pair, estimate, summary_of(pair, estimate, "a.png"), Context())
+        page = (tmp_path / "report.html").read_text(encoding="utf-8")
+        assert [text in page for text in texts] == [camera is None] * 2
+
+
 def test_a_file_name_in_a_note_or_in_the_command_cannot_add_to_the_page(rng, tmp_path):
     pair, estimate = wall(texture(rng, 60, 132), SHIFT_PX, None)
     hostile = "<script>alert(1)</script>$title & \"'"

@@ -242,6 +242,15 @@ def test_a_finger_enlarges_a_picture_on_a_phone_which_shows_all_without_scrollin
     phone.wait_for_selector("dialog .card", state="detached")
 
 
+def test_an_enlarged_picture_takes_most_of_a_phone_held_sideways(phone, report):
+    phone.set_viewport_size({"width": 844, "height": 390})
+    phone.goto(report.as_uri())
+    phone.get_by_role("button", name="Enlarge: Depth").tap()
+    # 70 % of the height, and in proportion
+    box = phone.locator("#depth").bounding_box()
+    assert (box["width"], box["height"]) == (pytest.approx(364, abs=1), pytest.approx(273, abs=1))
+
+
 def test_the_wiggle_moves_by_itself_until_it_is_paused(page, report):
     page.goto(report.as_uri())
     choose(page, "Wiggle")

@@ -237,6 +237,23 @@ def test_tilting_a_phone_moves_the_view_once_that_is_allowed(browser, photo):
 
 
 @pytest.mark.needs_chromium
+def test_a_slow_graphics_processor_draws_coarsely_in_motion_and_sharply_at_rest(browser, photo):
+    context = browser.new_context(viewport={"width": 800, "height": 600}, reduced_motion="reduce")
+    # Frames 0.1 s apart, as a slow processor draws them.
+    context.add_init_script(
+        "let at_ms = 0, ask = window.requestAnimationFrame;"
+        "window.requestAnimationFrame = (use) => ask.call(window, () => use((at_ms += 100)));"
+    )
+    page = open_page(context, photo)
+    width_px = page.evaluate("document.querySelector('#view').width")
+    page.evaluate("window.wander = setInterval(() => stereoweaveViewer.look(Math.random(), 0), 20)")
+    wait_until(page, f"document.querySelector('#view').width < {0.7 * width_px}")
+    page.evaluate("clearInterval(wander)")
+    wait_until(page, f"document.querySelector('#view').width === {width_px}")
+    context.close()
+
+
+@pytest.mark.needs_chromium
 def test_arrow_keys_move_the_view(browser, photo):
     page = open_page(browser.new_context(reduced_motion="reduce"), photo)
     page.focus("#view")

@@ -73,6 +73,11 @@ def write_matcher_files(
         if is_matcher(source):
             made = model_file(source)
             _check_apart(made, files)
+        elif not Path(source).exists():
+            raise StereoweaveError(
+                f"{source}: expected a run's folder, a checkpoint, an .onnx matcher file or a shipped "
+                f"network ({', '.join(shipped_models())}), found none of them"
+            )
         else:
             made = Path(folder, "any_size.onnx")
             yield _export_run(Path(source), made, pairs, reliability)

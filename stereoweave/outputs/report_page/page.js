@@ -143,8 +143,8 @@ async function unpackMaps() {
 }
 
 function formatDepth(depth_m) {
-  // The digits that a disparity to 1/64 px can support; as in report.py, beyond 10 km is only far.
-  if (depth_m < 0 || depth_m === Infinity) return "infinite";
+  // The digits that a disparity to 1/64 px can support; otherwise as in outputs/metres.py.
+  if (depth_m < 0 || depth_m === Infinity) return "infinity";
   return depth_m >= 10000 ? "over 10 km" : depth_m.toFixed(depth_m < 10 ? 3 : depth_m < 100 ? 2 : depth_m < 1000 ? 1 : 0) + " m";
 }
 

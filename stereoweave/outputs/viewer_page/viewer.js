@@ -3,7 +3,7 @@
 const StereoweaveViewer = (() => {
 "use strict";
 
-const IDLE_MS = 2500, SWAY_MS = 7000, SWAY_PART = 0.8, EASE_MS = 120, SLOW_MS = 40;
+const IDLE_MS = 2500, SWAY_MS = 7000, SWAY_PART = 0.8, EASE_MS = 120, SLOW_MS = 40, REST_MS = 300;
 const IDENTITY = new Float32Array([1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]);
 const VERTEX_SHADER = $vertex_shader;
 const FRAGMENT_SHADER = $fragment_shader;
@@ -82,7 +82,7 @@ async function makeViewer(canvas, scene, options = {}) {
   const middle = (first + last) / 2, reach = (last - first) / 2;
   const calm = matchMedia("(prefers-reduced-motion: reduce)").matches;
   const viewer = { view, sway: options.sway ?? !calm, target: [0, 0], eye: [0, 0] };
-  let touched_ms = -1e9, previous_ms = 0, drawn = null, sharpness = 1, slow = 0, visible = true, dragged = null;
+  let touched_ms = -1e9, previous_ms = 0, moved_ms = 0, drawn = null, sharpness = 1, slow = 0, visible = true, dragged = null;
 
   /** Look from (u, v), each -1 to 1, to the right and up. */
   viewer.look = (u, v) => {
@@ -91,8 +91,8 @@ async function makeViewer(canvas, scene, options = {}) {
   };
   viewer.stop = () => { visible = false; watcher?.disconnect(); viewer.stopped = true; };
 
-  function resize() {
-    const scale = Math.max(devicePixelRatio || 1, 1) * sharpness;
+  function resize(sharp) {
+    const scale = Math.max(devicePixelRatio || 1, 1) * sharp;
     const width = Math.min(Math.round(canvas.clientWidth * scale), Math.round(1.25 * scene.shown_px[2]));
     const height = Math.round(width * scene.shown_px[3] / scene.shown_px[2]);
     if (width > 0 && (canvas.width !== width || canvas.height !== height)) {
@@ -115,10 +115,15 @@ async function makeViewer(canvas, scene, options = {}) {
     const share = 1 - Math.exp(-Math.min(passed_ms, 100) / EASE_MS);
     viewer.eye = viewer.eye.map((at, k) => at + share * (viewer.target[k] - at));
     const [u, v] = viewer.eye;
-    resize();
-    if (drawn && Math.abs(drawn[0] - u) + Math.abs(drawn[1] - v) < 1e-4) return;
+    const still = drawn && Math.abs(drawn[0] - u) + Math.abs(drawn[1] - v) < 1e-4;
+    // At rest, one sharp frame costs nothing.
+    const rested = still && now_ms - moved_ms > REST_MS;
+    resize(rested ? 1 : sharpness);
+    if (drawn && still) return;
     drawn = [u, v];
     view.draw(middle + reach * u, scene.up * v);
+    if (rested) return;
+    moved_ms = now_ms;
     // A slow graphics processor draws fewer pixels rather than fewer frames.
     slow = passed_ms > SLOW_MS ? slow + Math.min(passed_ms / SLOW_MS, 4) : Math.max(0, slow - 1);
     if (slow > 12 && sharpness > 0.3) {

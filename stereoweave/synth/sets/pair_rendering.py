@@ -68,7 +68,10 @@ class RenderSpec:
         if self.scene not in SCENES:
             raise StereoweaveError(f"scene: expected one of {', '.join(SCENES)}, found {self.scene!r}")
         if self.rig is not None:
-            _centred_camera(*self.rig, self.size_px)  # raises if invalid
+            try:
+                _centred_camera(*self.rig, self.size_px)
+            except StereoweaveError as error:
+                raise StereoweaveError(str(error), setting="rig") from error
 
 
 @dataclass(frozen=True, kw_only=True)
