@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from rich.progress import Progress
 
-from stereoweave.cameras.alignment import SWAPPED, check_pair
+from stereoweave.cameras.alignment import RECTIFY, SWAPPED, check_pair
 from stereoweave.cameras.auto_align import Aligned, align
 from stereoweave.cameras.diagnosis import find_problems
 from stereoweave.errors import Note, Remedy
@@ -25,6 +25,8 @@ from stereoweave.video.reader import StereoVideo, format_time
 _SURVEYED_FRAMES, _CHECKED_FRAMES = 24, 3
 _SURVEY_STEP_PX = 4
 _NAMED_SPANS = 3
+# Videos cannot be rectified by a calibration.
+_REMEDY_OF_RECTIFIED = Remedy("rectify the frames by a calibration first")
 # The percentiles exclude outliers. The margin allows for objects that come nearer between surveyed frames.
 _OUTER_PERCENT, _MARGIN_PX = 0.5, 8.0
 
@@ -48,7 +50,7 @@ class Survey(NamedTuple):
 def survey_video(
     video: StereoVideo, matcher: Matcher, bar: Progress, *, rectified: bool = True
 ) -> tuple[Survey, list[Note]]:
-    """Measure the disparities of frames spread over the whole video, and find defects.
+    """Measure the disparities of frames spread over the whole video; return them, and notes on the video.
 
     The first frames alone are not enough, because they may be titles with a different disparity range. If
     `rectified`, frames out of line are aligned first.
@@ -69,7 +71,9 @@ def survey_video(
         middles_px.append(median_disparity_px(estimate))
         flat.append((frame.time, "same_picture" in aligned.alignment.defects))
         if index in checked:
-            problems = [] if flat[-1][1] else find_problems(aligned.pair, estimate, aligned.alignment)
+            remedy = _REMEDY_OF_RECTIFIED if rectified else RECTIFY
+            problems = find_problems(aligned.pair, estimate, aligned.alignment, remedy)
+            problems = [] if flat[-1][1] else problems
             defects.append([_add_time(frame.time, note, video) for note in [*aligned.notes, *problems]])
         bar.advance(shown)
     all_px = np.vstack(thinned)
