@@ -83,7 +83,7 @@ def survey_video(
         _find_match_range_px(all_px, matcher),
         2 * sum(swapped) > len(swapped),
     )
-    return survey, [*_note_flat(flat), *_select_common_notes(defects)]
+    return survey, [*video.notes, *_note_flat(flat), *_select_common_notes(defects)]
 
 
 def _note_flat(frames: Sequence[tuple[Fraction, bool]]) -> list[Note]:
