@@ -19,7 +19,7 @@ from stereoweave.arguments import (
     describe,
     is_plain_array,
 )
-from stereoweave.errors import StereoweaveError
+from stereoweave.errors import Note, StereoweaveError
 
 # Limit of cv2.remap, which indexes pixels with 16-bit integers.
 LONGEST_SIDE_PX = 32_766
@@ -168,6 +168,7 @@ class Estimate:
         occluded: Mask, bool, of the pixels that only the left camera sees.
         pair: The aligned pair that the estimate belongs to, if `estimate` aligned it; None if the estimate
             belongs to the images as given.
+        notes: Notes on how `estimate` aligned the pair, or why it could not; `str` gives their text.
     """
 
     disparity_px: Float[np.ndarray, "h w"]
@@ -175,6 +176,7 @@ class Estimate:
     confidence: Float[np.ndarray, "h w"]
     occluded: Bool[np.ndarray, "h w"]
     pair: StereoPair | None = None
+    notes: tuple[Note, ...] = ()
 
     def __post_init__(self) -> None:
         if self.pair is not None:

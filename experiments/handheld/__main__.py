@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Sequence
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -14,6 +15,15 @@ from stereoweave.io.files import make_folder
 from stereoweave.io.images import write_image
 
 
+class Kind(StrEnum):
+    """What the command scores."""
+
+    plain = "plain"
+    warped = "warped"
+    swaps = "swaps"
+    known_cameras = "known_cameras"
+
+
 def handheld(
     real: Annotated[Path, typer.Argument(help="Folder of real pairs, as for stereoweave bench pairs.")],
     out: Annotated[Path | None, typer.Option("--out", "-o", help="CSV file to write.")] = None,
@@ -21,10 +31,17 @@ def handheld(
         Path | None,
         typer.Option(help="Folder to write instead: the pictures, and true correspondences in points.npz."),
     ] = None,
+    kind: Annotated[
+        Kind,
+        typer.Option(
+            help="What to score: plain (the 200 pairs), warped (20 of them with five further distortions), "
+            "swaps (these 20 as they are and with their sides swapped), or known_cameras (20 rendered "
+            "pairs whose focal length and baseline are known)."
+        ),
+    ] = Kind.plain,
 ) -> None:
-    """Score rectification without a calibration on 200 simulated hand-held pairs."""
+    """Score rectification without a calibration on simulated hand-held pairs."""
     from experiments.handheld.pairs import make_handheld_pairs
-    from experiments.handheld.scoring import score_handheld_pairs, summarize
     from stereoweave.bench.tables import write_csv
 
     if pictures:
@@ -36,10 +53,29 @@ def handheld(
         return
     if out:
         make_parent_folder(out)
-    rows = score_handheld_pairs(real)
+    rows, summary = _score(kind, real)
     if out:
         write_csv(out, rows)
-    typer.echo(summarize(rows))
+    typer.echo(summary)
+
+
+def _score(kind: Kind, real: Path) -> tuple[Sequence[object], str]:
+    """Return the rows, and their summary."""
+    from experiments.handheld import known_cameras, scoring
+
+    match kind:
+        case Kind.plain:
+            plain = scoring.score_handheld_pairs(real)
+            return plain, scoring.summarize(plain)
+        case Kind.warped:
+            warped = scoring.score_warped_pairs(real)
+            return warped, scoring.summarize_warped(warped)
+        case Kind.swaps:
+            swaps = scoring.score_swaps(real)
+            return swaps, scoring.summarize_swaps(swaps)
+        case Kind.known_cameras:
+            known = known_cameras.score_known_cameras()
+            return known, known_cameras.summarize_known_cameras(known)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import cycle, islice
 from pathlib import Path
 
 import cv2
@@ -58,13 +57,18 @@ class HandheldPair:
     right_px: Float[np.ndarray, "n 2"]
 
 
-def make_handheld_pairs(real: Path) -> Iterator[HandheldPair]:
-    """Yield pairs made from rendered originals, then pairs made from each real pair of a folder in turn."""
+def make_handheld_pairs(real: Path, step: int = 1) -> Iterator[HandheldPair]:
+    """Yield pairs made from rendered originals, then pairs made from each real pair of a folder in turn.
+
+    Args:
+        real: Folder of real pairs.
+        step: Only every so many pairs are made; each of them is the same for any step.
+    """
     scenes = list_scenes(real)
-    for index, original in enumerate(_render_originals()):
+    for index, original in render_originals(step):
         yield take_again(original, index)
-    for index, read in enumerate(islice(cycle(scenes), PAIRS_EACH), start=PAIRS_EACH):
-        scene = read()
+    for index in range(PAIRS_EACH, 2 * PAIRS_EACH, step):
+        scene = scenes[(index - PAIRS_EACH) % len(scenes)]()
         # Any focal length fits a rectified pair of unknown depth; this one is typical of a phone.
         focal_px = float(scene.pair.left.shape[1])
         original = Original(name=scene.name, pair=scene.pair, truth_px=scene.truth_px, focal_px=focal_px)
@@ -80,8 +84,19 @@ def take_again(original: Original, index: int, ranges: Ranges = RANGES) -> Handh
         ranges: Ranges of the random parameters.
     """
     rng = np.random.default_rng((SEED, index))
+    cameras = draw_cameras(rng, ranges, original.pair.left.shape[1], original.focal_px)
+    return take_with(cameras, original, index, rng, ranges)
+
+
+def take_with(
+    cameras: tuple[HandheldCamera, HandheldCamera],
+    original: Original,
+    index: int,
+    rng: np.random.Generator,
+    ranges: Ranges,
+) -> HandheldPair:
+    """Retake a rectified pair with these two cameras; see `take_again`."""
     before = Size(original.pair.left.shape[1], original.pair.left.shape[0])
-    cameras = draw_cameras(rng, ranges, before.width, original.focal_px)
     size = _find_size(cameras, before)
     left, right = (
         _take(camera, image, size, before)
@@ -97,21 +112,26 @@ def take_again(original: Original, index: int, ranges: Ranges = RANGES) -> Handh
     )
 
 
-def _render_originals() -> Iterator[Original]:
+def render_originals(step: int = 1) -> Iterator[tuple[int, Original]]:
+    """Yield the numbers and the originals of every so many rendered pairs."""
     from stereoweave.synth.sets.pair_rendering import RenderSpec, render_pair
     from stereoweave.synth.sets.renderers import shared_renderer
 
-    for scene, count in SCENES.items():
+    numbered = [(scene, index) for scene, count in SCENES.items() for index in range(count)]
+    for number in range(0, len(numbered), step):
+        scene, index = numbered[number]
         spec = RenderSpec(scene=scene, seed=SEED, size_px=_RENDERED_PX)
-        for index in range(count):
-            sample = render_pair(shared_renderer(), spec, index).sample
-            assert sample.camera is not None
-            yield Original(
+        sample = render_pair(shared_renderer(), spec, index).sample
+        assert sample.camera is not None
+        yield (
+            number,
+            Original(
                 name=scene,
                 pair=StereoPair(left=sample.left, right=sample.right),
                 truth_px=sample.disparity_px,
                 focal_px=sample.camera.focal_px,
-            )
+            ),
+        )
 
 
 def _find_size(cameras: tuple[HandheldCamera, HandheldCamera], original: Size) -> Size:

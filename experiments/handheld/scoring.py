@@ -1,6 +1,7 @@
 """Scores of rectification on simulated hand-held pairs."""
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -8,11 +9,15 @@ import numpy as np
 from jaxtyping import Float
 
 from experiments.handheld.pairs import HandheldPair, make_handheld_pairs
+from experiments.handheld.warps import warp_in_each_way
+from stereoweave.cameras.auto_align import align, swap
 from stereoweave.cameras.picture_warp import PictureWarp
 from stereoweave.cameras.rectify_uncalibrated import fit_warps
 from stereoweave.errors import StereoweaveError
 
 _LOST_STEP_PX = 4
+# Every so many pairs are distorted further, and swapped.
+_PAIR_STEP = 10
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,6 +50,57 @@ def score_handheld_pairs(real: Path) -> list[HandheldRow]:
     return [score(made) for made in make_handheld_pairs(real)]
 
 
+@dataclass(frozen=True, kw_only=True)
+class WarpedRow(HandheldRow):
+    """Score of one pair that is distorted further by `warp`, a name in `warp_in_each_way`."""
+
+    warp: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SwapRow:
+    """Whether `align` swaps the sides of a sound pair, and of the same pair with its sides swapped."""
+
+    pair: str
+    swapped_falsely: bool
+    swap_found: bool
+
+
+def score_warped_pairs(real: Path) -> list[WarpedRow]:
+    """Rectify some of the pairs, distorted as by wide lenses, rolling shutters and warped prints."""
+    return [
+        WarpedRow(**vars(score(warped)), warp=warp)
+        for number, made in enumerate(make_handheld_pairs(real, _PAIR_STEP))
+        for warp, warped in warp_in_each_way(made, number)
+    ]
+
+
+def score_swaps(real: Path) -> list[SwapRow]:
+    """Align some of the pairs with their sides as they are, and swapped."""
+    return [
+        SwapRow(
+            pair=made.name,
+            swapped_falsely=align(made.pair).swapped,
+            swap_found=align(swap(made.pair)).swapped,
+        )
+        for made in make_handheld_pairs(real, _PAIR_STEP)
+    ]
+
+
+def summarize_warped(rows: list[WarpedRow]) -> str:
+    """Describe how many pairs end below 0.5 px with each distortion."""
+    names = dict.fromkeys(row.warp for row in rows)
+    return "\n".join(f"{name}: {summarize([row for row in rows if row.warp == name])}" for name in names)
+
+
+def summarize_swaps(rows: list[SwapRow]) -> str:
+    """Describe how many pairs are swapped falsely, and how many swaps are found."""
+    return (
+        f"{sum(row.swapped_falsely for row in rows)} of {len(rows)} sound pairs are swapped, and "
+        f"{sum(row.swap_found for row in rows)} of {len(rows)} swapped ones"
+    )
+
+
 def score(made: HandheldPair) -> HandheldRow:
     """Rectify one pair, and measure its errors at the true correspondences."""
     height, width = made.pair.left.shape[:2]
@@ -66,7 +122,7 @@ def score(made: HandheldPair) -> HandheldRow:
     )
 
 
-def summarize(rows: list[HandheldRow]) -> str:
+def summarize(rows: Sequence[HandheldRow]) -> str:
     """Describe how many pairs end below 0.5 px, and how many of these keep 90 % of the left picture."""
     good = [row for row in rows if row.vertical_error_px < 0.5]
     kept = sum(row.lost_percent <= 10 for row in good)

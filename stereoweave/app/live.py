@@ -2,7 +2,7 @@
 
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import cv2
@@ -13,6 +13,7 @@ from stereoweave.app.capture import Capture, Moment
 from stereoweave.app.screen import Screen
 from stereoweave.cameras.rectify import rectify
 from stereoweave.cameras.rig import Rig
+from stereoweave.errors import Note
 from stereoweave.io.colormap import colour_disparity, find_colour_range_px
 from stereoweave.matching.estimate import match
 from stereoweave.matching.matcher import Matcher
@@ -70,6 +71,7 @@ def show(  # noqa: PLR0913 - source, output and settings
     *,
     format: str | None = None,
     rig: Rig | None = None,
+    tell: Callable[[Note], None] = lambda note: None,
 ) -> None:
     """Show captured images and their disparity until the sources end.
 
@@ -80,11 +82,16 @@ def show(  # noqa: PLR0913 - source, output and settings
         tally: Statistics, updated with each frame so that they are valid even after an error.
         format: Frame packing of a single source, a name in `PAIR_LAYOUTS`. Default: detected.
         rig: Calibration with which to rectify the images. Default: the images are already rectified.
+        tell: Function that is called with each note on the sources, at the first frame.
     """
     range_px: tuple[float, float] | None = None
     while moment := capture.newest(tally.last):
         if capture.count == 1 and format is None:
             format = detect_layout(capture.name, moment.pictures)
+        if format and not tally.shown:
+            height_px, width_px = moment.pictures[0].shape[:2]
+            for note in PAIR_LAYOUTS[format].note_odd_size(width_px, height_px):
+                tell(note)
         pair = _split_pair(moment.pictures, format)
         pair = rectify(pair, rig).pair if rig else pair
         disparity_px = match(matcher, pair).disparity_px

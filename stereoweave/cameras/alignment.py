@@ -29,7 +29,7 @@ DEFECTS: tuple[Defect, ...] = get_args(Defect)
 ROW_DEFECTS: tuple[Defect, ...] = ("vertical_shift", "rotation", "scale", "not_rectified")
 
 SWAPPED = Note("left and right are swapped", Remedy("give them the other way round"))
-_RECTIFY = Remedy("rectify the pair", ("rectify",))
+RECTIFY = Remedy("rectify the pair", ("rectify",))
 
 # Tolerated vertical error; the tolerance grows with the side length of larger pictures.
 _TOLERATED_PX = 0.75
@@ -136,7 +136,7 @@ class Alignment:
             case "swapped":
                 return SWAPPED
             case "vertical_shift" | "rotation" | "scale" | "not_rectified":
-                return Note(self._describe_rows(defect), _RECTIFY)
+                return Note(self._describe_rows(defect), RECTIFY)
             case "exposure":
                 ratio = max(self.exposure_ratio, 1 / self.exposure_ratio)
                 which = "right" if self.exposure_ratio > 1 else "left"

@@ -1,8 +1,10 @@
 """Diagnosis of a matched pair: notes on defects that the user should know about."""
 
+from dataclasses import replace
+
 import numpy as np
 
-from stereoweave.cameras.alignment import Alignment, check_pair
+from stereoweave.cameras.alignment import RECTIFY, Alignment, check_pair
 from stereoweave.errors import Note, Remedy
 from stereoweave.stereo import Estimate, StereoPair
 
@@ -11,7 +13,12 @@ _CONFIDENT = 0.5
 _LEAST_CONFIDENT_PERCENT = 30.0
 
 
-def find_problems(pair: StereoPair, estimate: Estimate, alignment: Alignment | None = None) -> list[Note]:
+def find_problems(
+    pair: StereoPair,
+    estimate: Estimate,
+    alignment: Alignment | None = None,
+    remedy: Remedy = RECTIFY,
+) -> list[Note]:
     """Return notes on a pair's problems; a sound pair has none.
 
     The alignment is measured at feature matches (`stereoweave check` reports it in full). If there are too
@@ -21,12 +28,13 @@ def find_problems(pair: StereoPair, estimate: Estimate, alignment: Alignment | N
         pair: The pair.
         estimate: The pair's estimate.
         alignment: The pair's alignment, if it has been measured already.
+        remedy: What to do if rows are apart; another one than the default if rectification was tried.
     """
     alignment = alignment or check_pair(pair.left, pair.right)
     if alignment.is_known:
         warnings = alignment.warnings()
         if warnings:
-            return warnings
+            return [replace(note, remedy=remedy) if note.remedy == RECTIFY else note for note in warnings]
     seen = np.ones(estimate.confidence.shape, bool) if pair.left_seen is None else pair.left_seen
     confident_percent = 100 * float((estimate.confidence >= _CONFIDENT)[seen].mean()) if seen.any() else 0.0
     if confident_percent < _LEAST_CONFIDENT_PERCENT:
@@ -36,7 +44,7 @@ def find_problems(pair: StereoPair, estimate: Estimate, alignment: Alignment | N
             Note(
                 f"only {confident_percent:.0f} % of the disparities are confident: the pictures may be too "
                 "plain, show different scenes, be swapped or not be rectified",
-                Remedy("rectify the pair", ("rectify",)),
+                remedy,
             )
         ]
     return []

@@ -79,7 +79,15 @@ def live(  # noqa: PLR0913 - each is an option of the command line
             webbrowser.open(screen.url)
         with suppress(KeyboardInterrupt):
             try:
-                show(capture, screen, matcher, tally, format=format, rig=rig)
+                show(
+                    capture,
+                    screen,
+                    matcher,
+                    tally,
+                    format=format,
+                    rig=rig,
+                    tell=lambda note: typer.echo(str(note)),
+                )
             finally:
                 typer.echo(f"{capture.name}: {tally.describe()}")
             typer.echo("end of the video; its last picture stays on the page until Ctrl-C")

@@ -155,7 +155,8 @@ def view(  # noqa: PLR0913 - each is an option of the command line
     make_parent_folder(file.path)
     estimate = match(Backend(model=model, threads=threads, provider=provider).matcher(), pair, options)
     typer.echo(f"{file.path}: {file.write(pair, estimate, prepared.pictures)}")
-    for note in (*prepared.notes, *find_problems(pair, estimate, prepared.alignment)):
+    problems = find_problems(pair, estimate, prepared.alignment, prepared.remedy)
+    for note in (*prepared.notes, *problems):
         typer.echo(note.format(running_options()))
 
 

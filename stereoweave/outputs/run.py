@@ -9,9 +9,9 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from stereoweave.cameras.alignment import Alignment
+from stereoweave.cameras.alignment import RECTIFY, Alignment
 from stereoweave.cameras.diagnosis import find_problems
-from stereoweave.errors import NameOf, Note, keyword
+from stereoweave.errors import NameOf, Note, Remedy, keyword
 from stereoweave.matching.estimate import match_many
 from stereoweave.matching.matcher import Matcher
 from stereoweave.matching.options import MatchOptions
@@ -34,6 +34,7 @@ class Result:
         notes: Notes on what was detected or changed while the pictures were read.
         threads: Number of threads for rendering; default: all cores.
         alignment: The alignment of the pair, if it has been measured.
+        remedy: What to do if rows are apart.
         date: When the pair was matched.
         command: The command that asked for the result, as typed; "" if there was none.
         name_of: The front end's names for settings, for the notes in the report.
@@ -45,6 +46,7 @@ class Result:
     notes: tuple[Note, ...] = ()
     threads: int | None = None
     alignment: Alignment | None = None
+    remedy: Remedy = RECTIFY
     date: datetime | None = None
     command: str = ""
     name_of: NameOf = keyword
@@ -74,7 +76,7 @@ class Result:
 
     @cached_property
     def _problems(self) -> tuple[Note, ...]:
-        return tuple(find_problems(self.pair, self.estimate, self.alignment))
+        return tuple(find_problems(self.pair, self.estimate, self.alignment, self.remedy))
 
     @cached_property
     def point_cloud(self) -> PointCloud:
@@ -112,6 +114,7 @@ def run_many(prepared: Sequence[Prepared], matcher: Matcher, options: MatchOptio
             notes=each.notes,
             threads=matcher.threads,
             alignment=each.alignment,
+            remedy=each.remedy,
             date=date,
         )
         for each, estimate in zip(prepared, estimates, strict=True)

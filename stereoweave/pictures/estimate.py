@@ -43,7 +43,7 @@ def estimate(  # noqa: PLR0913 - all but the images are keyword-only and optiona
         range_px: See `MatchOptions`.
         align: "auto" for pictures of unknown cameras: if the rows are apart or the sides are swapped, the
             pair is aligned first (`auto_align.align`). The estimate then belongs to the aligned pair, which
-            it holds as `pair`. Default: the images must be rectified.
+            it holds as `pair`, with `notes` on what was changed. Default: the images must be rectified.
 
     Raises:
         ValueError: MatcherError for an unknown model or an unavailable provider, ProviderError for a provider
@@ -54,6 +54,8 @@ def estimate(  # noqa: PLR0913 - all but the images are keyword-only and optiona
     options = MatchOptions(range_px=range_px, refined=refined, raw=raw)
     given = StereoPair(left=as_rgb(left, "left"), right=as_rgb(right, "right"))
     matcher = Backend(model=model, threads=threads, provider=provider).matcher()
-    pair = auto_align.align(given).pair if align else given
-    found = match(matcher, pair, options)
-    return found if pair is given else replace(found, pair=pair)
+    if not align:
+        return match(matcher, given, options)
+    aligned = auto_align.align(given)
+    found = match(matcher, aligned.pair, options)
+    return replace(found, pair=None if aligned.pair is given else aligned.pair, notes=aligned.notes)

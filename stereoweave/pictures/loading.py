@@ -157,12 +157,17 @@ def _open_one(path: Path, format: str | None) -> Opened:
         name, why = _detect_picture_layout(path, image), "detected from name and content"
     notes = [Note(f"{name}, {why}", _OVERRIDE)] if why else []
     layout = PAIR_LAYOUTS[name]
-    left, right = _split_views(path, layout.trim(image), layout)
+    left, right = _split_views(path, image, layout)
     height_px, width_px = left.shape[:2]
     return Opened(
         pair=StereoPair(left=left, right=right),
         layout=name,
-        notes=(*notes, *_note_trimming(image, layout), *_note_turns(lies), *_note_colours([decoded])),
+        notes=(
+            *notes,
+            *layout.note_odd_size(image.shape[1], image.shape[0]),
+            *_note_turns(lies),
+            *_note_colours([decoded]),
+        ),
         lens=exif.read_lens(decoded.tags, width_px, height_px),
     )
 
@@ -300,14 +305,6 @@ def _read_lens(decoded: Sequence[DecodedPicture]) -> exif.Lens | None:
     """Read camera parameters from the tags of both pictures; the first picture's tags take precedence."""
     first, second = decoded
     return exif.read_lens({**second.tags, **first.tags}, *first.image.size)
-
-
-def _note_trimming(image: UInt8[np.ndarray, "h w 3"], layout: PairLayout) -> list[Note]:
-    line, size = ("column", "width") if layout.beside else ("row", "height")
-    size_px = image.shape[1 if layout.beside else 0]
-    if size_px % 2 == 0:
-        return []
-    return [Note(f"the last {line} is dropped, because the {size}, {size_px} px, is odd")]
 
 
 def _note_turns(lies: int | None) -> list[Note]:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from stereoweave.errors import FormatError, Remedy
+from stereoweave.errors import FormatError, Note, Remedy
 from stereoweave.io.images import SMALLEST_SIDE_PX
 from stereoweave.pictures.anaglyphs import looks_like_anaglyph
 
@@ -28,25 +28,26 @@ class PairLayout(NamedTuple):
         """Return the width and height of one view at full size.
 
         Raises:
-            FormatError: The frame cannot be halved, or its halves are too small.
+            FormatError: The halves of the frame are too small.
         """
         side, extent_px = ("width", width_px) if self.beside else ("height", height_px)
-        if extent_px % 2 or extent_px < 2 * SMALLEST_SIDE_PX:
+        if extent_px < 2 * SMALLEST_SIDE_PX:
             raise FormatError(
-                f"expected an even {side} of at least {2 * SMALLEST_SIDE_PX} pixels for two views, "
-                f"found {width_px}x{height_px}; crop or rescale it first"
+                f"expected a {side} of at least {2 * SMALLEST_SIDE_PX} pixels for two views, "
+                f"found {width_px}x{height_px}; give a larger picture"
             )
         if self.half:
-            return width_px, height_px
+            even_px = extent_px // 2 * 2
+            return (even_px, height_px) if self.beside else (width_px, even_px)
         return (width_px // 2, height_px) if self.beside else (width_px, height_px // 2)
 
-    def trim(self, frame: Frame) -> Picture:
-        """Return a frame whose width (or height) is even: without its last column (or row) if it is odd."""
-        height_px, width_px = frame.shape[:2]
-        return frame[:, : width_px // 2 * 2] if self.beside else frame[: height_px // 2 * 2]
-
     def eyes(self, frame: Frame) -> tuple[Picture, Picture]:
-        """Return the left and the right view of a frame, each at full size."""
+        """Return the left and the right view of a frame, each at full size.
+
+        Of a frame of odd width (or height), the last column (or row) is dropped.
+        """
+        height_px, width_px = frame.shape[:2]
+        frame = frame[:, : width_px // 2 * 2] if self.beside else frame[: height_px // 2 * 2]
         first, second = np.split(frame, 2, axis=1 if self.beside else 0)
         if self.half:
             size_px = frame.shape[1], frame.shape[0]
@@ -55,6 +56,13 @@ class PairLayout(NamedTuple):
             )
         left, right = (second, first) if self.right_first else (first, second)
         return np.ascontiguousarray(left), np.ascontiguousarray(right)
+
+    def note_odd_size(self, width_px: int, height_px: int) -> list[Note]:
+        """Return a note on the column or row that `eyes` drops from frames of this size, if it drops one."""
+        line, size, extent_px = ("column", "width", width_px) if self.beside else ("row", "height", height_px)
+        if extent_px % 2 == 0:
+            return []
+        return [Note(f"the last {line} is dropped, because the {size}, {extent_px} px, is odd")]
 
 
 PAIR_LAYOUTS = {

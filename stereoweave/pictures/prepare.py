@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from stereoweave.cameras.alignment import Alignment
+from stereoweave.cameras.alignment import RECTIFY, Alignment
 from stereoweave.cameras.auto_align import align
 from stereoweave.cameras.calibration_files import read_rig
 from stereoweave.cameras.rectify import Rectified, rectify
@@ -14,6 +14,9 @@ from stereoweave.io.exif import Lens
 from stereoweave.pictures.loading import open_pictures
 from stereoweave.stereo import StereoCamera, StereoPair
 from stereoweave.system.steps import step
+
+CALIBRATE = Remedy("give a calibration", ("calibration",))
+_CALIBRATE_AGAIN = Remedy("give a calibration of these cameras", ("calibration",))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,13 +48,15 @@ class Request:
 class Prepared:
     """A pair ready for matching, its picture files, and notes on what was detected or changed.
 
-    `alignment` is the alignment of the pair, if it has been measured.
+    `alignment` is the alignment of the pair, if it has been measured. `remedy` is what to do if rows are
+    apart nevertheless.
     """
 
     pair: StereoPair
     pictures: tuple[Path, ...]
     notes: tuple[Note, ...] = ()
     alignment: Alignment | None = None
+    remedy: Remedy = RECTIFY
 
 
 @step("opening the pictures")
@@ -69,7 +74,12 @@ def prepare(pictures: Sequence[Path], request: Request) -> Prepared:
     opened = open_pictures(pictures, request.format)
     if request.calibration:
         ready = _apply_calibration(opened.pair, request.calibration, bool(request.rectify))
-        return Prepared(pair=ready.pair, pictures=tuple(pictures), notes=(*opened.notes, *ready.notes))
+        return Prepared(
+            pair=ready.pair,
+            pictures=tuple(pictures),
+            notes=(*opened.notes, *ready.notes),
+            remedy=_CALIBRATE_AGAIN,
+        )
     camera, notes = _find_camera(opened.pair, opened.lens or Lens(), request)
     pair = replace(opened.pair, camera=camera)
     in_metres = request.focal_px is not None or request.baseline_m is not None
@@ -79,6 +89,7 @@ def prepare(pictures: Sequence[Path], request: Request) -> Prepared:
         pictures=tuple(pictures),
         notes=(*opened.notes, *notes, *found.notes),
         alignment=found.alignment,
+        remedy=CALIBRATE if found.alignment else RECTIFY,
     )
 
 
@@ -141,6 +152,6 @@ def _align(pair: StereoPair, rectified: bool | None) -> _Ready:
         return ready
     lost = Note(
         "no depth in metres: rectification from feature matches did not find the cameras parallel",
-        Remedy("give a calibration", ("calibration",)),
+        CALIBRATE,
     )
     return replace(ready, notes=(*ready.notes, lost))

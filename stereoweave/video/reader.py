@@ -52,6 +52,7 @@ class StereoVideo:
         sound: File that contains the sound; None for a silent video.
         excerpted: Name of the part of a longer video that this is, such as "1440+120" for 120 frames from
             frame 1440 on; None for a whole video.
+        notes: Note on the column or row that is dropped from frames of odd width or height.
         on_frame: Function that `frames` calls with the number of each frame that it yields, to show progress.
     """
 
@@ -63,6 +64,7 @@ class StereoVideo:
         self.name = ", ".join(track.name for track in tracks)
         self.frame_packing = frame_packing
         self.size_px = self._split.eye_size_px(*first.size_px) if self._split else first.size_px
+        self.notes = tuple(self._split.note_odd_size(*first.size_px)) if self._split else ()
         self.frame_count = min(len(track.steps) for track in tracks)
         self.rate, self.time_base = first.rate, first.time_base
         self.sound = next((track.sound for track in tracks if track.sound), None)
@@ -140,7 +142,7 @@ def open_video(
 
     Raises:
         FormatError: A file cannot be read, is not 3-D, does not match the other file, or has frames that
-            cannot be split into two equal halves.
+            are too small for two views.
         StereoweaveError: The frame packing is unknown, the number of paths is not one or two, a rate is given
             for a video, or PyAV is missing.
     """

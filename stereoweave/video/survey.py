@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from rich.progress import Progress
 
-from stereoweave.cameras.alignment import SWAPPED, check_pair
+from stereoweave.cameras.alignment import RECTIFY, SWAPPED, check_pair
 from stereoweave.cameras.auto_align import Aligned, align
 from stereoweave.cameras.diagnosis import find_problems
 from stereoweave.errors import Note, Remedy
@@ -32,6 +32,8 @@ _SURVEYED_FRAMES, _CHECKED_FRAMES = 24, 3
 _SURVEYED_WIDTH_PX = 320
 _SURVEY_STEP_PX = 4
 _NAMED_SPANS = 3
+# Videos cannot be rectified by a calibration.
+_REMEDY_OF_RECTIFIED = Remedy("rectify the frames by a calibration first")
 # The percentiles exclude outliers. The margin allows for objects that come nearer between surveyed frames.
 _OUTER_PERCENT, _MARGIN_PX = 0.5, 8.0
 
@@ -77,7 +79,7 @@ class _Sample(NamedTuple):
 def survey_video(
     video: StereoVideo, matcher: Matcher, bar: Progress, *, rectified: bool = True, threads: int | None = None
 ) -> tuple[Survey, list[Note]]:
-    """Measure the disparities of frames spread over the whole video, and find defects.
+    """Measure the disparities of frames spread over the whole video; return them, and notes on the video.
 
     The first frames alone are not enough, because they may be titles with a different disparity range. If
     `rectified`, frames out of line are aligned first.
@@ -107,7 +109,7 @@ def survey_video(
         _find_match_range_px(all_px, matcher),
         2 * sum(sample.alignment.swapped for sample in samples) > len(samples),
     )
-    return survey, [*_note_flat(samples), *_select_common_notes(defects)]
+    return survey, [*video.notes, *_note_flat(samples), *_select_common_notes(defects)]
 
 
 def _sample_frame(frame: StereoFrame, matcher: Matcher, *, rectified: bool, checked: bool) -> _Sample:
@@ -126,7 +128,8 @@ def _sample_frame(frame: StereoFrame, matcher: Matcher, *, rectified: bool, chec
         list(aligned.notes) if checked else None,
     )
     if sample.notes is not None and not sample.is_flat:
-        sample.notes.extend(find_problems(aligned.pair, estimate, aligned.alignment))
+        remedy = _REMEDY_OF_RECTIFIED if rectified else RECTIFY
+        sample.notes.extend(find_problems(aligned.pair, estimate, aligned.alignment, remedy))
     return sample
 
 

@@ -319,6 +319,18 @@ def test_a_tally_reports_frames_their_rate_and_their_delay(tmp_path):
     assert tally.describe() == "3 of 5 frames shown, 1.0 per second, 333 ms after capture"
 
 
+def test_of_an_odd_width_the_last_column_is_dropped_and_told_once(tmp_path):
+    both = example_frame()
+    odd = np.hstack([both, both[:, -1:]])
+    told, tally = [], LiveTally()
+    cv2.imwrite(str(tmp_path / "0.png"), odd[..., ::-1])
+    cv2.imwrite(str(tmp_path / "1.png"), odd[..., ::-1])
+    with Screen(0) as screen, Capture([str(tmp_path / "%d.png")]) as capture:
+        show(capture, screen, Matcher(), tally, format="side_by_side", tell=told.append)
+    assert tally.shown > 0
+    assert list(map(str, told)) == ["the last column is dropped, because the width, 321 px, is odd"]
+
+
 def test_two_videos_are_shown_as_the_left_image_and_its_disparity(tmp_path):
     left, right = np.split(cv2.resize(example_frame(), (640, 240)), 2, axis=1)
     sources = [write_video(tmp_path / "left.avi", [left]), write_video(tmp_path / "right.avi", [right])]
@@ -390,6 +402,6 @@ def test_an_unknown_frame_packing_is_refused_before_anything_is_opened():
 
 
 def test_a_frame_that_cannot_be_halved_is_refused(tmp_path):
-    cv2.imwrite(str(tmp_path / "frame000.png"), np.zeros((64, 95, 3), np.uint8))
-    with pytest.raises(FormatError, match="found 95x64"):
+    cv2.imwrite(str(tmp_path / "frame000.png"), np.zeros((64, 61, 3), np.uint8))
+    with pytest.raises(FormatError, match="found 61x64"):
         live([str(tmp_path / "frame%03d.png")], format="side_by_side", port=0, browser=False)

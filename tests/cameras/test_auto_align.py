@@ -5,8 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from camera_examples import Taken, rolling_shutter, take, turn, wide_lens
+from camera_examples import Taken, take, turn
 
+from experiments.handheld.warps import rolling_shutter, wide_lens
 from stereoweave.cameras.alignment import check_pair
 from stereoweave.cameras.auto_align import align
 from stereoweave.cameras.rectify_uncalibrated import fit_warps

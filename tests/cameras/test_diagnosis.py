@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from stereoweave.cameras.diagnosis import find_problems
+from stereoweave.errors import Remedy
 from stereoweave.io.images import read_image, read_pair
 from stereoweave.learn.data.collage import paint_collage
 from stereoweave.matching.matcher import Matcher
@@ -51,6 +52,17 @@ def test_a_pair_that_is_not_rectified_gets_one_note(example):
     )
     (line,) = find_problems(lower, estimate_of(lower, 0.1))
     assert str(line) == "the right picture is 2.0 px higher than the left one; rectify the pair (rectify)"
+
+
+def test_after_a_rectification_the_remedy_is_another_one(example):
+    lower = StereoPair(
+        left=np.ascontiguousarray(example.left[:-2]), right=np.ascontiguousarray(example.right[2:])
+    )
+    calibrate = Remedy("give a calibration", ("calibration",))
+    (line,) = find_problems(lower, estimate_of(lower, 0.9), remedy=calibrate)
+    assert str(line).endswith("than the left one; give a calibration (calibration)")
+    (line,) = find_problems(plain_pair(), estimate_of(plain_pair(), 0.1), remedy=calibrate)
+    assert str(line).endswith("not be rectified; give a calibration (calibration)")
 
 
 def test_negative_disparities_by_themselves_are_no_reason_for_a_line(example):

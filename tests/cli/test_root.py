@@ -130,7 +130,10 @@ def mistakes(pictures) -> Path:
             ["left.png with 96x64", "narrow.png with 80x64 pixels", "the same size"],
         ),
         ("depth tiny.png tiny.png -o out", ["tiny.png", "at least 32x32", "found 31x64"]),
-        ("depth tiny.png --format side_by_side -o out", ["tiny.png", "an even width", "found 30x64"]),
+        (
+            "depth tiny.png --format side_by_side -o out",
+            ["tiny.png", "a width of at least 64", "found 31x64"],
+        ),
         ("depth left.png right.png both.png -o out", ["two pictures, left and right", "found 3", "both.png"]),
         ("view left.png right.png both.png left.png -o out.png", ["two pictures, left and right", "found 4"]),
         (

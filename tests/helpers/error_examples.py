@@ -19,22 +19,21 @@ LAYOUTS = (
 
 
 def write_error_examples(folder: Path) -> None:
-    """Write a pair, the same pair with the right picture 2 px lower or with converging cameras, plain
-    pictures, and a calibration.
+    """Write a pair, the same pair with the right picture 2 px lower, converging cameras or a zoomed
+    right picture, plain pictures, and a calibration.
     """
     for name in ("left.png", "right.png"):
         shutil.copy(TEXTURED / name, folder)
     left, right = (read_image(TEXTURED / name) for name in ("left.png", "right.png"))
     write_image(folder / "upper.png", left[2:])
     write_image(folder / "lower.png", right[:-2])
-    nowhere = np.zeros((1, 2))
-    inwards = take(
-        Taken(StereoPair(left=left, right=right), nowhere, nowhere),
-        turn((640, 480), (0, 1, 0)),
-        turn((640, 480), (0, -1, 1)),
-    )
+    size, nowhere = (640, 480), np.zeros((1, 2))
+    pair = Taken(StereoPair(left=left, right=right), nowhere, nowhere)
+    inwards = take(pair, turn(size, (0, 1, 0)), turn(size, (0, -1, 1)))
+    zoomed = take(pair, turn(size, (0, 0, 0)), turn(size, (0, 0, 0), scale=1.12))
     write_image(folder / "inwards_left.png", inwards.pair.left)
     write_image(folder / "inwards_right.png", inwards.pair.right)
+    write_image(folder / "zoomed.png", zoomed.pair.right)
     write_image(folder / "both.png", np.hstack([left, right]))
     write_image(folder / "plain.png", np.full((480, 640, 3), 90, np.uint8))
     write_rig(folder / "turned.yml", rig_of(pinhole))

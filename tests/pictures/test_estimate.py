@@ -42,6 +42,14 @@ def test_a_view_of_an_aligned_estimate_shows_the_aligned_pair(lower):
     np.testing.assert_array_equal(view.image, found.pair.left)
 
 
+def test_the_estimate_says_how_the_pair_was_aligned(lower, example):
+    (note,) = sw.estimate(*lower, align="auto").notes
+    assert str(note).startswith("rectified with ")
+    assert sw.estimate(*lower).notes == ()
+    swapped = sw.estimate(example.right, example.left, align="auto")
+    assert list(map(str, swapped.notes)) == ["left and right were swapped, and have been swapped back"]
+
+
 def test_a_sound_pair_gives_the_same_with_and_without_alignment(example):
     aligned = sw.estimate(example.left, example.right, align="auto")
     assert aligned.pair is None

@@ -500,9 +500,9 @@ def test_what_view_writes_without_two_eyes_is_refused_by_its_name(tmp_path, pair
 @pytest.mark.parametrize(
     ("size", "format", "found"),
     [
-        ((63, 64), "side_by_side", "even width of at least 64 pixels for two views, found 62x64"),
+        ((63, 64), "side_by_side", "width of at least 64 pixels for two views, found 63x64"),
         ((62, 64), "crossed", "found 62x64"),
-        ((64, 62), "top_bottom", "even height"),
+        ((64, 62), "top_bottom", "height of at least 64"),
         ((96, 20), "side_by_side", "expected at least 32x32 pixels, found 48x20"),
     ],
 )

@@ -153,17 +153,27 @@ def test_only_two_views_of_one_scene_resemble_each_other():
     assert np.isnan(measure_resemblance(left * 0, left))
 
 
-def test_an_odd_width_is_refused_side_by_side_and_accepted_top_bottom(tmp_path):
-    path = write_video(tmp_path / "video.mkv", [np.zeros((96, 161, 3), np.uint8)], codec="ffv1")
-    for format in ("side_by_side", "side_by_side_half", "crossed"):
-        message = refusal(path, format=format)
-        assert message.startswith(f"{path}: ")
-        assert "even width" in message
-        assert "161x96" in message
-    assert open_video([path], "top_bottom").size_px == (161, 48)
-    assert "even height" in refusal(
-        write_video(tmp_path / "b.mkv", [np.zeros((97, 160, 3), np.uint8)], codec="ffv1"),
-        format="top_bottom",
+@pytest.mark.parametrize(
+    ("format", "size_px", "line"),
+    [
+        ("side_by_side", (80, 97), "column is dropped, because the width, 161 px, is odd"),
+        ("side_by_side_half", (160, 97), "column is dropped, because the width, 161 px, is odd"),
+        ("top_bottom", (161, 48), "row is dropped, because the height, 97 px, is odd"),
+    ],
+)
+def test_of_an_odd_size_the_last_line_is_dropped_and_told(tmp_path, format, size_px, line):
+    noise = np.random.default_rng(0).integers(0, 256, (97, 161, 3), dtype=np.uint8)
+    video = open_video([write_video(tmp_path / "video.mkv", [noise], codec="libx264rgb")], format)
+    assert video.size_px == size_px
+    assert [str(note) for note in video.notes] == [f"the last {line}"]
+    (frame,) = video.frames()
+    assert frame.left.shape == frame.right.shape == (size_px[1], size_px[0], 3)
+
+
+def test_a_frame_too_small_for_two_views_is_refused(tmp_path):
+    path = write_video(tmp_path / "video.mkv", [np.zeros((96, 61, 3), np.uint8)], codec="ffv1")
+    assert refusal(path, format="crossed").startswith(
+        f"{path}: expected a width of at least 64 pixels for two views, found 61x96"
     )
 
 

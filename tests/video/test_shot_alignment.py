@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
-from camera_examples import Taken, rolling_shutter, take, turn
+from camera_examples import Taken, take, turn
 
+from experiments.handheld.warps import rolling_shutter
 from stereoweave.cameras.alignment import check_pair
 from stereoweave.learn.data.collage import paint_collage
 from stereoweave.stereo import StereoPair

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from rich.console import Console
-from video_examples import write_side_by_side
+from video_examples import write_side_by_side, write_video
 
 from stereoweave.learn.data.collage import paint_collage
 from stereoweave.matching.matcher import Matcher
@@ -52,3 +52,9 @@ def test_a_plain_frame_is_not_called_flat(tmp_path, matcher, painted):
     grey = np.full((SIZE[1], SIZE[0], 3), 90, np.uint8)
     film = write_side_by_side(tmp_path / "film_SBS.mkv", [painted] * 4 + [(grey, grey)])
     assert survey_notes(film, matcher) == []
+
+
+def test_a_dropped_column_is_noted(tmp_path, matcher, painted):
+    odd = np.hstack([*painted, painted[1][:, :1]])
+    film = write_video(tmp_path / "film_SBS.mkv", [odd] * 2, codec="ffv1")
+    assert survey_notes(film, matcher) == ["the last column is dropped, because the width, 641 px, is odd"]
