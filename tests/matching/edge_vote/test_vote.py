@@ -68,6 +68,24 @@ def test_a_speckle_disappears_and_a_large_object_stays(red_before_blue):
     np.testing.assert_array_equal(found_px[18:32, 8:22], 30)
 
 
+@pytest.mark.parametrize(("confidence", "expected_px"), [(0.4, 20), (0.6, 50)])
+def test_a_larger_speckle_disappears_where_it_is_doubted(red_before_blue, confidence, expected_px):
+    estimate = estimate_of(np.full((40, 60), 20.0))
+    estimate.disparity_px[10:26, 5:21] = 50
+    estimate.confidence[10:26, 5:21] = confidence
+    found_px = vote_at_edges(red_before_blue, estimate).disparity_px
+    np.testing.assert_array_equal(found_px[12:24, 7:19], expected_px)
+
+
+def test_a_plain_surface_is_filled_to_its_middle(rng):
+    estimate = estimate_of(np.full((130, 130), 20.0))
+    estimate.disparity_px[10:120, 10:120] = 60 * rng.random((110, 110))
+    estimate.confidence[10:120, 10:120] = 0
+    found = vote_at_edges(np.full((130, 130, 3), 90, np.uint8), estimate)
+    np.testing.assert_array_equal(found.disparity_px, 20)
+    np.testing.assert_array_equal(found.confidence[10:120, 10:120], 0)
+
+
 @pytest.fixture
 def unsure_area():
     """Return an estimate of confidence 0.9, with an area of confidence 0.1 that is 1.5 px nearer."""
