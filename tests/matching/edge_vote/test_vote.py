@@ -41,10 +41,11 @@ def test_the_kernel_agrees_with_its_plain_reference(rng):
     disparity_px, confidence = ((scale * rng.random((20, 30))).astype(np.float32) for scale in (50, 1))
     sound = rng.random((20, 30)) > 0.5
     sound[:12, :12] = False
-    voted_px, unsound = disparity_px.copy(), ~sound
-    vote(lab, disparity_px, confidence, sound, voted_px, unsound, 0, 20)
-    expected_px, still_unsound = plain_vote(lab.astype(float), disparity_px, confidence, sound)
+    voted_px, agreement, unsound = disparity_px.copy(), np.full((20, 30), np.nan, np.float32), ~sound
+    vote(lab, disparity_px, confidence, sound, voted_px, agreement, unsound, 0, 20)
+    expected_px, agreed, still_unsound = plain_vote(lab.astype(float), disparity_px, confidence, sound)
     np.testing.assert_array_equal(voted_px, expected_px)
+    np.testing.assert_allclose(agreement, agreed, rtol=1e-4, atol=1e-6)
     np.testing.assert_array_equal(unsound, still_unsound)
     assert unsound.any()
 
@@ -67,13 +68,70 @@ def test_a_speckle_disappears_and_a_large_object_stays(red_before_blue):
     np.testing.assert_array_equal(found_px[18:32, 8:22], 30)
 
 
-def test_an_unsure_area_takes_the_disparity_around_it_and_stays_unsure(red_before_blue):
+@pytest.mark.parametrize(("confidence", "expected_px"), [(0.4, 20), (0.6, 50)])
+def test_a_larger_speckle_disappears_where_it_is_doubted(red_before_blue, confidence, expected_px):
+    estimate = estimate_of(np.full((40, 60), 20.0))
+    estimate.disparity_px[10:26, 5:21] = 50
+    estimate.confidence[10:26, 5:21] = confidence
+    found_px = vote_at_edges(red_before_blue, estimate).disparity_px
+    np.testing.assert_array_equal(found_px[12:24, 7:19], expected_px)
+
+
+def test_a_plain_surface_is_filled_to_its_middle(rng):
+    estimate = estimate_of(np.full((130, 130), 20.0))
+    estimate.disparity_px[10:120, 10:120] = 60 * rng.random((110, 110))
+    estimate.confidence[10:120, 10:120] = 0
+    found = vote_at_edges(np.full((130, 130, 3), 90, np.uint8), estimate)
+    np.testing.assert_array_equal(found.disparity_px, 20)
+    np.testing.assert_array_equal(found.confidence[10:120, 10:120], 0)
+
+
+@pytest.fixture
+def unsure_area():
+    """Return an estimate of confidence 0.9, with an area of confidence 0.1 that is 1.5 px nearer."""
     estimate = estimate_of(np.full((40, 60), 20.0))
     estimate.disparity_px[10:20, 5:20] = 21.5
     estimate.confidence[10:20, 5:20] = 0.1
-    found = vote_at_edges(red_before_blue, estimate)
+    return estimate
+
+
+def test_an_unsure_area_takes_the_disparity_around_it(red_before_blue, unsure_area):
+    np.testing.assert_array_equal(vote_at_edges(red_before_blue, unsure_area).disparity_px, 20)
+
+
+def test_the_confidence_of_a_replaced_disparity_follows_from_its_neighbours(red_before_blue, unsure_area):
+    confidence = vote_at_edges(red_before_blue, unsure_area).confidence
+    # All neighbours of the corner that vote have confidence 0.9 and agree; it had 0.1 itself.
+    assert confidence[10, 5] == pytest.approx(0.29 + 0.32 * 0.9 + 0.25 * 0.1)
+    # The area's middle is filled from what was filled.
+    assert 0.29 < confidence[15, 12] < confidence[10, 5] - 0.05
+
+
+def test_a_replaced_disparity_that_one_camera_sees_is_less_confident(red_before_blue, unsure_area):
+    unsure_area.occluded[10:20, 5:20] = True
+    confidence = vote_at_edges(red_before_blue, unsure_area).confidence
+    assert confidence[10, 5] == pytest.approx(0.18 + 0.32 * 0.9 + 0.25 * 0.1)
+
+
+def test_neighbours_that_disagree_lower_the_confidence(red_before_blue):
+    disparity_px = np.where(np.arange(60) < 30, 20.0, 5.0) * np.ones((40, 1))
+    at_edge = vote_at_edges(red_before_blue, estimate_of(disparity_px)).confidence[20, 29]
+    within_red = vote_at_edges(red_before_blue, estimate_of(np.roll(disparity_px, -15, 1))).confidence[20, 14]
+    assert at_edge == pytest.approx(0.29 + 0.57 * 0.9)
+    # The pixel's own side has between half and two thirds of the weight.
+    assert 0.29 + 0.25 * 0.9 + 0.32 * 0.9 / 2 < within_red < 0.29 + 0.25 * 0.9 + 0.32 * 0.9 * 2 / 3
+
+
+def test_a_disparity_that_is_kept_loses_a_quarter_of_its_doubt(red_before_blue):
+    confidence = vote_at_edges(red_before_blue, estimate_of(np.full((40, 60), 20.0), 0.6)).confidence
+    np.testing.assert_allclose(confidence, 0.7, rtol=1e-6)
+
+
+def test_what_is_replaced_where_the_image_is_plain_keeps_confidence_0(red_before_blue, unsure_area):
+    unsure_area.confidence[10:20, 5:20] = 0
+    found = vote_at_edges(red_before_blue, unsure_area)
     np.testing.assert_array_equal(found.disparity_px, 20)
-    np.testing.assert_array_equal(found.confidence, estimate.confidence)
+    np.testing.assert_array_equal(found.confidence[10:20, 5:20], 0)
 
 
 def test_sound_disparities_do_not_change(red_before_blue, rng):
