@@ -165,7 +165,7 @@ def enlarge(
 
 
 def rehearse_upsampling() -> None:
-    """Upsample a small estimate, to compile all kernels (`kernel_cache.compile_ahead`)."""
+    """Upsample a small estimate, to compile all kernels (`compiling_ahead.compile_ahead`)."""
     image, px = np.zeros((64, 64, 3), np.uint8), np.zeros((32, 32), np.float32)
     enlarge(image, image, Estimate(disparity_px=px, right_disparity_px=px, confidence=px, occluded=px > 0), 1)
 

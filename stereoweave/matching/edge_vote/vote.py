@@ -45,7 +45,7 @@ def vote_at_edges(
 
 
 def rehearse_voting() -> None:
-    """Vote on a small estimate, to compile the kernel (`kernel_cache.compile_ahead`)."""
+    """Vote on a small estimate, to compile the kernel (`compiling_ahead.compile_ahead`)."""
     image, px = np.zeros((32, 32, 3), np.uint8), np.zeros((32, 32), np.float32)
     estimate = Estimate(disparity_px=px, right_disparity_px=px, confidence=px, occluded=px > 0)
     vote_at_edges(image, estimate, 1)
