@@ -74,12 +74,14 @@ def shows_steps(command: Callable[Given, None]) -> Callable[Given, None]:
 
     @functools.wraps(command)
     def run(*args: Given.args, **kwargs: Given.kwargs) -> None:
-        # They import rich and filelock, for which --help need not wait.
-        from stereoweave.system.compiling_ahead import compiling_ahead
+        # It imports rich, for which --help need not wait.
         from stereoweave.system.progress import show_steps
 
-        with show_steps(), compiling_ahead():
-            command(*args, **kwargs)
+        with show_steps():
+            from stereoweave.system.compiling_ahead import compiling_ahead
+
+            with compiling_ahead():
+                command(*args, **kwargs)
 
     return run
 

@@ -5,7 +5,7 @@ import hashlib
 import os
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from importlib.metadata import version
 from pathlib import Path
 
@@ -41,7 +41,7 @@ def kernels_folder() -> Path:
 def compile_once(kernel: str, code: str) -> Iterator[None]:
     """Load or compile a kernel in the block, while no other process or thread compiles it.
 
-    Compiling is announced as a step, as it takes seconds.
+    Compiling, and waiting for who compiles, is announced as a step, as it takes seconds.
 
     Args:
         kernel: Name of the kernel.
@@ -61,11 +61,9 @@ def compile_once(kernel: str, code: str) -> Iterator[None]:
             yield
         return
     try:
-        if is_first or not lock.is_locked:
-            with step(_COMPILING):
+        with step(_COMPILING) if is_first else nullcontext():
+            if not lock.is_locked:
                 lock.acquire()
-                yield
-        else:
             yield
     finally:
         lock.release()

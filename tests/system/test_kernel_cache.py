@@ -75,3 +75,20 @@ def test_the_folder_is_the_user_s_unless_numba_s_variable_names_another(tmp_path
     if os.name == "posix" and sys.platform != "darwin":
         monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
         assert kernels_folder().parent == tmp_path / "stereoweave" / "kernels"
+
+
+def test_waiting_for_a_process_that_loads_a_kernel_is_not_announced():
+    told, order = [], []
+    with compile_once("one", "one.o"):
+        (kernels_folder() / "one.o").write_bytes(b"")
+
+        def load():
+            with listening(told.append), compile_once("one", "one.o"):
+                order.append("loaded")
+
+        thread = threading.Thread(target=load)
+        thread.start()
+        thread.join(0.1)
+        order.append("known")
+    thread.join()
+    assert (told, order) == ([], ["known", "loaded"])
