@@ -175,7 +175,7 @@ class Matcher:
         """
         found = to_subpixel(pair.left, pair.right, found, self.threads)
         if refined or self.refines:
-            from stereoweave.matching.refine import refine  # Numba takes half a second to import
+            from stereoweave.matching.refine import refine  # it loads LLVM
 
             found = refine(pair.left, pair.right, found, self.threads)
             found = to_subpixel(pair.left, pair.right, found, self.threads)

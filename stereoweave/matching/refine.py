@@ -89,7 +89,7 @@ def _settle(
     towards: int,
 ) -> Float32[np.ndarray, "h w"]:
     """Replace a view's disparities with the matched disparities at which both views agree."""
-    from stereoweave.matching import refine_kernels as kernels  # Numba takes half a second to import
+    from stereoweave.matching import refine_kernels as kernels  # it loads LLVM
 
     settled_px = np.array(disparity_px, np.float32, order="C")
     agreed = np.empty(settled_px.shape, bool)

@@ -101,7 +101,7 @@ class _StripView:
 
     def cues(self, rows: slice, threads: int) -> tuple[_StripCues, _StripCues]:
         """Return the cues of both images for `upsample_kernels.match`."""
-        from stereoweave.matching import upsample_kernels as kernels  # Numba takes half a second to import
+        from stereoweave.matching import upsample_kernels as kernels  # it loads LLVM
 
         with ThreadPoolExecutor(threads) as pool:
             own, other = pool.map(lambda grey: _cues(grey, rows), (self.grey, self.other))

@@ -57,7 +57,7 @@ def _vote(
     confidence: Float32[np.ndarray, "h w"],
     threads: int | None,
 ) -> Float32[np.ndarray, "h w"]:
-    from stereoweave.matching.edge_vote.vote_kernels import vote  # Numba takes half a second to import
+    from stereoweave.matching.edge_vote.vote_kernels import vote  # it loads LLVM
 
     lab = cv2.cvtColor(image.astype(np.float32) / 255, cv2.COLOR_RGB2LAB)
     disparity_px = np.array(disparity_px, np.float32)
