@@ -23,6 +23,7 @@ from stereoweave.matching.left_right_check import OCCLUSION_STEP_PX, is_occluded
 from stereoweave.matching.occlusion_fill import fill_occluded
 from stereoweave.matching.options import MatchOptions
 from stereoweave.matching.providers import CPU, PROVIDERS, explain_failure, open_session
+from stereoweave.matching.refine import refine
 from stereoweave.matching.subpixel import to_subpixel
 from stereoweave.stereo import LONGEST_SIDE_PX, Estimate, StereoPair
 from stereoweave.system.threads import thread_count
@@ -175,8 +176,6 @@ class Matcher:
         """
         found = to_subpixel(pair.left, pair.right, found, self.threads)
         if refined or self.refines:
-            from stereoweave.matching.refine import refine  # it loads LLVM
-
             found = refine(pair.left, pair.right, found, self.threads)
             found = to_subpixel(pair.left, pair.right, found, self.threads)
         found = fill_occluded(found, pair.left_seen)
