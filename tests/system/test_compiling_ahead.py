@@ -4,11 +4,14 @@ import subprocess
 import sys
 import threading
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from stereoweave.system import compiling_ahead as ahead
 from stereoweave.system import shipped_kernels
 from stereoweave.system.compiling_ahead import compile_ahead, compiling_ahead
+from stereoweave.system.kernel_cache import kernels_folder
 
 # Its tests would need a function that waits forever and that another process can import.
 pytestmark = pytest.mark.skipif(not hasattr(signal, "pause"), reason="Windows cannot wait for a signal")
@@ -64,6 +67,41 @@ def test_a_thread_compiles_shipped_kernels_ahead_once(tmp_path):
     # The first program has what its thread compiled; the second one loads it.
     assert rehearse(tmp_path, shipped_kernels.FOLDER) == "0 0 0 0\n[] 1\n"
     assert rehearse(tmp_path, shipped_kernels.FOLDER) == "1 1 1 1\n[] 1\n"
+
+
+@pytest.fixture
+def pair(rng, tmp_path, monkeypatch):
+    """Write a pair of 95x64 with a disparity of 8 px to the folder pairs/one of the current one."""
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "pairs" / "one"
+    folder.mkdir(parents=True)
+    photograph = Image.fromarray(rng.integers(0, 256, (8, 13, 3), dtype=np.uint8)).resize((104, 64))
+    photograph.crop((0, 0, 95, 64)).save(folder / "left.png")
+    photograph.crop((8, 0, 103, 64)).save(folder / "right.png")
+
+
+def compiled_by(line):
+    """Run a command, and return the modules of the kernels that it has compiled."""
+    subprocess.run([sys.executable, "-m", "stereoweave", *line.split()], check=True, capture_output=True)
+    return {file.name.split(".")[-4] for file in kernels_folder().glob("*.o")}
+
+
+RENDERING = {"background_kernels", "draw_kernels", "hole_filling_kernels"}
+
+
+@pytest.mark.skipif(not shipped_kernels.kernels_ship(), reason="none ships for this machine")
+@pytest.mark.parametrize(
+    ("line", "modules"),
+    [
+        ("depth pairs --raw -o many", set()),
+        ("depth pairs -o many", {"refine_kernels", "vote_kernels"}),
+        ("depth pairs/one/left.png pairs/one/right.png --raw -o out", RENDERING),
+        ("view pairs/one/left.png pairs/one/right.png --layout rgbd -o view.png", {"refine_kernels"}),
+    ],
+    ids=["no report, raw", "no report", "raw", "no view"],
+)
+def test_a_command_compiles_only_what_it_needs(pair, line, modules):
+    assert compiled_by(line) == modules
 
 
 def test_a_library_starts_no_process(no_shipped_kernels):
