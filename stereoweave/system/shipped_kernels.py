@@ -13,10 +13,11 @@ import lzma
 import platform
 import re
 import sys
+import threading
 import zlib
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -125,6 +126,7 @@ class ShippedKernel:
     kinds: str
     file: Path
     loads: int = 0
+    _lock: threading.Lock = field(default_factory=threading.Lock)
     _run: Any = None
     _engine: Any = None
 
@@ -142,7 +144,8 @@ class ShippedKernel:
         bitcode = lzma.decompress(self.file.read_bytes())
         digest = hashlib.sha256(repr((bitcode, *_processor())).encode()).hexdigest()[:12]
         file = f"{self.name}.{digest}.o"
-        with compile_once(self.name, file):
+        # The second lock is for a folder without locks: no thread may replace the code that another one runs.
+        with compile_once(self.name, file), self._lock:
             if self._run is None:
                 code = self._load(file) or self._compile(bitcode, file)
                 self._engine, self._run = _link(code, self.kinds)

@@ -2,6 +2,7 @@ import json
 import lzma
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from importlib import import_module
 from pathlib import Path
 
@@ -117,6 +118,25 @@ def test_damaged_machine_code_is_made_again(no_kernels):
     file.write_bytes(made[:100] + bytes(100) + made[200:])
     assert run("") == f"{CODES} False\n"
     assert file.read_bytes() == made
+
+
+@shipped_here
+def test_threads_share_the_machine_code_without_a_writable_folder(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file"))
+    made = []
+    link = shipped_kernels._link
+    monkeypatch.setattr(shipped_kernels, "_link", lambda *given: made.append(link(*given)) or made[-1])
+    kernel = shipped_kernels.find_shipped("stereoweave.matching.refine_kernels.census")
+
+    def run(_):
+        codes = np.zeros((1, 2), np.uint32)
+        kernel(flatten((np.array([[3, 5]], np.uint8), codes))[1])
+        return codes.tolist()
+
+    with ThreadPoolExecutor(4) as pool:
+        assert list(pool.map(run, range(4))) == [CODES] * 4
+    assert len(made) == 1  # a second one would free the code that other threads run
 
 
 @shipped_here
