@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,6 +16,7 @@ from stereoweave.cameras.rig import Optics, Rig, Size, format_size
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io.decoding import ENDINGS
 from stereoweave.io.images import read_image
+from stereoweave.system.steps import step
 
 FEWEST_PAIRS = 5
 # A pair with an error of more than this many times the median has a misdetected corner or was taken in
@@ -130,7 +131,6 @@ def calibrate(
     board: Board,
     *,
     fisheye: bool = False,
-    progress: Callable[[str], None] = lambda _: None,
 ) -> Calibration:
     """Calibrate a rig from a folder of board pictures.
 
@@ -144,7 +144,6 @@ def calibrate(
         board: The printed board.
         fisheye: Use the fisheye model of Kannala and Brandt instead of a pinhole with distortion
             k1 k2 p1 p2 k3.
-        progress: Called with the name of each pair before its corners are detected.
 
     Raises:
         StereoweaveError: The folder does not exist, it contains fewer than FEWEST_PAIRS usable pairs, or the
@@ -153,12 +152,13 @@ def calibrate(
     pairs, left_out = find_pairs(Path(folder))
     if not board.dictionary:
         _check_count_of_corners(list(pairs.values()), board)
-    seen, size_px = _find_all_corners(pairs, board, left_out, progress)
+    seen, size_px = _find_all_corners(pairs, board, left_out)
     _check_enough(len(seen), len(pairs), board, left_out)
     solve = _solve_fisheye if fisheye else _solve_pinhole
     while True:
         try:
-            solution = solve(board.corners_m(), seen, size_px)
+            with step("calibrating"):
+                solution = solve(board.corners_m(), seen, size_px)
         except cv2.error as error:
             raise StereoweaveError(
                 f"{folder}: expected pairs that suffice for a calibration, found {len(seen)} pairs for which "
@@ -239,20 +239,18 @@ def find_pairs(folder: Path) -> tuple[dict[str, tuple[Path, Path]], dict[str, st
 
 
 def _find_all_corners(
-    pairs: Mapping[str, tuple[Path, Path]],
-    board: Board,
-    left_out: dict[str, str],
-    progress: Callable[[str], None],
+    pairs: Mapping[str, tuple[Path, Path]], board: Board, left_out: dict[str, str]
 ) -> tuple[list[PairCorners], Size]:
     """Find the corners in every pair; return the corners in pairs of the most common size, and that size."""
     seen: list[tuple[PairCorners, Size]] = []
-    for name, paths in pairs.items():
-        progress(name)
-        try:
-            left, right = (cv2.cvtColor(read_image(path), cv2.COLOR_RGB2GRAY) for path in paths)
-            seen.append((find_pair_corners(name, left, right, board), (left.shape[1], left.shape[0])))
-        except FormatError as error:
-            left_out[name] = str(error)
+    with step("finding the board", total=len(pairs)) as advance:
+        for name, paths in pairs.items():
+            try:
+                left, right = (cv2.cvtColor(read_image(path), cv2.COLOR_RGB2GRAY) for path in paths)
+                seen.append((find_pair_corners(name, left, right, board), (left.shape[1], left.shape[0])))
+            except FormatError as error:
+                left_out[name] = str(error)
+            advance(1)
     if not seen:
         return [], (0, 0)
     size_px = Counter(size for _, size in seen).most_common(1)[0][0]

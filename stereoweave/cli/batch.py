@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from stereoweave.cli.commands import running_command, running_options
+from stereoweave.cli.commands import running_command, running_options, shows_steps
 from stereoweave.cli.options import (
     AsJson,
     BaselineM,
@@ -50,6 +50,7 @@ Write = Annotated[
 ]
 
 
+@shows_steps
 def batch(  # noqa: PLR0913 - each is an option of the command line
     source: Source,
     destination: Destination,

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from stereoweave.cli.commands import Commands
+from stereoweave.cli.commands import Commands, shows_steps
 from stereoweave.cli.options import (
     Cluster,
     Model,
@@ -73,6 +73,7 @@ bench = Commands("Score matchers, new views, videos and trained networks.")
 
 
 @bench.command()
+@shows_steps
 def pairs(  # noqa: PLR0913 - each is an option of the command line
     folder: ScenesFolder,
     out: CsvFile = Path("pairs.csv"),
@@ -119,6 +120,7 @@ def pairs(  # noqa: PLR0913 - each is an option of the command line
 
 
 @bench.command()
+@shows_steps
 def collages(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the set, new or empty.")],
     pairs: Annotated[int, typer.Option(min=1, help="Number of pairs.")] = 16,
@@ -136,6 +138,7 @@ def collages(
 
 
 @bench.command()
+@shows_steps
 def views(  # noqa: PLR0913 - each is an option of the command line
     folder: Annotated[
         Path,
@@ -174,6 +177,7 @@ def views(  # noqa: PLR0913 - each is an option of the command line
 
 
 @bench.command()
+@shows_steps
 def flicker(  # noqa: PLR0913 - each is an option of the command line
     scenes: Annotated[
         list[str], typer.Argument(metavar="SCENE...", help="Names of scenes, as for synth make.")
@@ -200,6 +204,7 @@ def flicker(  # noqa: PLR0913 - each is an option of the command line
 
 
 @bench.command()
+@shows_steps
 def networks(
     runs: Annotated[
         list[Path],
@@ -229,6 +234,7 @@ def networks(
 
 
 @bench.command()
+@shows_steps
 def parity(
     checkpoints: Annotated[
         list[Path],
@@ -252,6 +258,7 @@ def parity(
 
 
 @bench.command()
+@shows_steps
 def training(
     run: Annotated[Path, typer.Argument(help="Run folder of stereoweave train.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="CSV file to write; rows of other runs are kept.")],

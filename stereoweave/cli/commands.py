@@ -69,33 +69,21 @@ def running_options() -> NameOf:
 def shows_steps(command: Callable[Given, None]) -> Callable[Given, None]:
     """Make a command show its steps on stderr, and compile kernels ahead of their use.
 
-    See `progress.show_steps` and `kernel_cache.compile_ahead`.
+    See `progress.show_steps` and `compiling_ahead.compile_ahead`.
     """
 
     @functools.wraps(command)
     def run(*args: Given.args, **kwargs: Given.kwargs) -> None:
-        # They import rich and filelock, for which --help need not wait.
-        from stereoweave.system.kernel_cache import compiling_ahead
+        # It imports rich, for which --help need not wait.
         from stereoweave.system.progress import show_steps
 
-        with show_steps(), compiling_ahead():
-            command(*args, **kwargs)
+        with show_steps():
+            from stereoweave.system.compiling_ahead import compiling_ahead
+
+            with compiling_ahead():
+                command(*args, **kwargs)
 
     return run
-
-
-def compile_ahead_for_views(refined: bool, model: str) -> None:
-    """Start to compile the kernels that render views and, if needed, those that refine the disparity."""
-    from stereoweave.matching.edge_vote.vote import rehearse_voting
-    from stereoweave.matching.matcher import MODES
-    from stereoweave.matching.refine import rehearse_refining
-    from stereoweave.rendering.rehearsals import rehearse_drawing, rehearse_filling
-    from stereoweave.system.kernel_cache import compile_ahead
-
-    settles = model in MODES and MODES[model].refined
-    refining = [rehearse_refining] if refined or settles else []
-    voting = [rehearse_voting] if settles else []
-    compile_ahead(rehearse_drawing, *refining, *voting, rehearse_filling)
 
 
 class Command(TyperCommand):

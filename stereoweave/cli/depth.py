@@ -10,12 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stereoweave.cli.commands import (
-    compile_ahead_for_views,
-    running_command,
-    running_options,
-    shows_steps,
-)
+from stereoweave.cli.commands import running_command, running_options, shows_steps
 from stereoweave.cli.options import (
     AsJson,
     BaselineM,
@@ -112,7 +107,6 @@ def depth(  # noqa: PLR0913 - each is an option of the command line
     as_json: AsJson = False,
 ) -> None:
     """Estimate the depth of one or many stereo pairs. Writes maps, previews and an HTML report."""
-    compile_ahead_for_views(refined, model)
     from stereoweave.matching.backend import Backend
     from stereoweave.matching.options import MatchOptions
     from stereoweave.outputs.results import DepthJob, make_depth

@@ -101,6 +101,7 @@ def _check_output(pictures: Sequence[Path], calib: Path | None, out: Path) -> No
         )
 
 
+@shows_steps
 def calibrate(  # noqa: PLR0913 - each is an option of the command line
     folder: Annotated[
         Path,

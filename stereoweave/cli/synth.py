@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from stereoweave.cli.commands import Commands
+from stereoweave.cli.commands import Commands, shows_steps
 from stereoweave.cli.options import Cluster, make_engine, parse_size_px, require_synth_extra
 
 synth = Commands("Render and check stereo pairs with exact ground truth.")
@@ -22,6 +22,7 @@ Jobs = Annotated[int | None, typer.Option(min=1, help="Number of processes (defa
 
 
 @synth.command()
+@shows_steps
 def make(  # noqa: PLR0913 - each is an option of the command
     scene: Scene,
     pairs: Annotated[int, typer.Option(min=1, help="Number of pairs in the finished set.")],
@@ -78,6 +79,7 @@ def make(  # noqa: PLR0913 - each is an option of the command
 
 
 @synth.command()
+@shows_steps
 def check(
     folder: Annotated[Path, typer.Argument(help="Folder of a set made by synth make.")], jobs: Jobs = None
 ) -> None:
@@ -94,6 +96,7 @@ def check(
 
 
 @synth.command()
+@shows_steps
 def sheet(
     out: Annotated[Path, typer.Option("--out", "-o", help="Picture to write.")],
     seed: Annotated[int, typer.Option(min=0, help="Random seed, as for synth make.")] = 0,
@@ -124,6 +127,7 @@ def sheet(
 
 
 @synth.command()
+@shows_steps
 def costs(
     scene: Scene = "propeller",
     pairs: Annotated[int, typer.Option(min=1, help="Number of pairs to average over.")] = 3,

@@ -6,10 +6,12 @@ from typing import Annotated
 
 import typer
 
+from stereoweave.cli.commands import shows_steps
 from stereoweave.cli.options import require_train_extra
 from stereoweave.errors import StereoweaveError
 
 
+@shows_steps
 def train(
     recipe: Annotated[Path, typer.Argument(help="Recipe in TOML, such as recipes/weave_small.toml.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the run: a new one, or one to resume.")],
@@ -26,6 +28,7 @@ def train(
     train_recipe(recipe, out)
 
 
+@shows_steps
 def export(  # noqa: PLR0913 - each is an option of the command line
     source: Annotated[
         str,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stereoweave.cli.commands import compile_ahead_for_views, running_options, shows_steps
+from stereoweave.cli.commands import running_options, shows_steps
 from stereoweave.cli.options import (
     Format,
     Model,
@@ -121,7 +121,6 @@ def view(  # noqa: PLR0913 - each is an option of the command line
 
     Layouts are for 3-D viewers and displays.
     """
-    compile_ahead_for_views(True, model)
     from stereoweave.cameras.diagnosis import find_problems
     from stereoweave.cameras.rectify import crop as crop_to_content
     from stereoweave.matching.backend import Backend
@@ -130,6 +129,7 @@ def view(  # noqa: PLR0913 - each is an option of the command line
     from stereoweave.outputs.view_files import ViewFile
     from stereoweave.pictures.prepare import prepare
     from stereoweave.rendering.layouts import choose_layout
+    from stereoweave.system.compiling_ahead import compile_ahead
 
     out = out or _name_view(pictures, layout)
     name = choose_layout(out, layout)
@@ -153,6 +153,7 @@ def view(  # noqa: PLR0913 - each is an option of the command line
     pair = crop_to_content(prepared.pair)
     file = file.add_mark(pair)
     make_parent_folder(file.path)
+    compile_ahead(*file.rehearsals)
     estimate = match(Backend(model=model, threads=threads, provider=provider).matcher(), pair, options)
     typer.echo(f"{file.path}: {file.write(pair, estimate, prepared.pictures)}")
     problems = find_problems(pair, estimate, prepared.alignment, prepared.remedy)

@@ -17,16 +17,17 @@ from jaxtyping import Bool, Float, Shaped
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.images import SMALLEST_SIDE_PX
 from stereoweave.matching.disparity_range import find_range, goes_beyond
+from stereoweave.matching.edge_vote.vote import rehearse_voting
 from stereoweave.matching.left_right_check import at_match, find_occluded
 from stereoweave.matching.matcher import (
     PIXEL_PAIRS_AT_ONCE,
     Matcher,
 )
 from stereoweave.matching.options import DEFAULT_OPTIONS, MatchOptions
-from stereoweave.matching.refine import right_confidence
+from stereoweave.matching.refine import rehearse_refining, right_confidence
 from stereoweave.matching.upsample import enlarge, rehearse_upsampling
 from stereoweave.stereo import LONGEST_SIDE_PX, Estimate, StereoPair
-from stereoweave.system.kernel_cache import compile_ahead
+from stereoweave.system.compiling_ahead import compile_ahead
 from stereoweave.system.steps import step
 
 # Where the true disparity is outside a network's range, the network often predicts the end of the range, with
@@ -83,8 +84,7 @@ def match_many(
     matcher: Matcher, pairs: Sequence[StereoPair], options: MatchOptions = DEFAULT_OPTIONS
 ) -> list[Estimate]:
     """Match pairs of any size as `match` does, in batches of pairs with the same network input size."""
-    if not all(matcher.sees_whole(*pair.left.shape[1::-1]) for pair in pairs):
-        compile_ahead(rehearse_upsampling)
+    _compile_ahead(matcher, pairs, options)
     every_shown = [_prepare_first_input(matcher, pair, options.range_px) for pair in pairs]
     moved = [_shift(shown) for shown in every_shown]
     of_size: dict[tuple[int, ...], list[int]] = {}
@@ -97,6 +97,16 @@ def match_many(
         _finish(matcher, pair, shown, found[i], options)
         for i, (pair, shown) in enumerate(zip(pairs, every_shown, strict=True))
     ]
+
+
+def _compile_ahead(matcher: Matcher, pairs: Sequence[StereoPair], options: MatchOptions) -> None:
+    """Start to compile what follows the network."""
+    if not options.raw and (options.refined or matcher.refines):
+        compile_ahead(rehearse_refining)
+    if not options.raw and matcher.refines:
+        compile_ahead(rehearse_voting)
+    if not all(matcher.sees_whole(*pair.left.shape[1::-1]) for pair in pairs):
+        compile_ahead(rehearse_upsampling)
 
 
 def _clip_to_width(range_px: tuple[float, float], width_px: int) -> tuple[float, float]:

@@ -23,6 +23,7 @@ from stereoweave.matching.left_right_check import OCCLUSION_STEP_PX, is_occluded
 from stereoweave.matching.occlusion_fill import fill_occluded
 from stereoweave.matching.options import MatchOptions
 from stereoweave.matching.providers import CPU, PROVIDERS, explain_failure, open_session
+from stereoweave.matching.refine import refine
 from stereoweave.matching.subpixel import to_subpixel
 from stereoweave.stereo import LONGEST_SIDE_PX, Estimate, StereoPair
 from stereoweave.system.threads import thread_count
@@ -96,7 +97,7 @@ class Matcher:
         self.threads, self.provider = threads, provider
         mode = MODES.get(str(model))
         self.magnification = mode.magnification if mode else 1.0
-        self._refines = mode is not None and mode.refined
+        self.refines = mode is not None and mode.refined
         self._session = open_session(self._path, provider, thread_count(threads))
         try:
             self._outputs = self._read_outputs()
@@ -174,13 +175,11 @@ class Matcher:
         these two steps. The preset then corrects edges and speckles (`vote_at_edges`).
         """
         found = to_subpixel(pair.left, pair.right, found, self.threads)
-        if refined or self._refines:
-            from stereoweave.matching.refine import refine  # Numba takes half a second to import
-
+        if refined or self.refines:
             found = refine(pair.left, pair.right, found, self.threads)
             found = to_subpixel(pair.left, pair.right, found, self.threads)
         found = fill_occluded(found, pair.left_seen)
-        return vote_at_edges(pair.left, found, self.threads) if self._refines else found
+        return vote_at_edges(pair.left, found, self.threads) if self.refines else found
 
     def _check_sizes(self, pairs: Sequence[StereoPair]) -> None:
         sizes = sorted({pair.left.shape[:2] for pair in pairs})

@@ -76,7 +76,7 @@ def refine(
 
 
 def rehearse_refining() -> None:
-    """Refine a small estimate, to compile all kernels (`kernel_cache.compile_ahead`)."""
+    """Refine a small estimate, to compile all kernels (`compiling_ahead.compile_ahead`)."""
     image, px = np.zeros((32, 32, 3), np.uint8), np.zeros((32, 32), np.float32)
     refine(image, image, Estimate(disparity_px=px, right_disparity_px=px, confidence=px, occluded=px > 0), 1)
 
@@ -89,7 +89,7 @@ def _settle(
     towards: int,
 ) -> Float32[np.ndarray, "h w"]:
     """Replace a view's disparities with the matched disparities at which both views agree."""
-    from stereoweave.matching import refine_kernels as kernels  # Numba takes half a second to import
+    from stereoweave.matching import refine_kernels as kernels  # it loads LLVM
 
     settled_px = np.array(disparity_px, np.float32, order="C")
     agreed = np.empty(settled_px.shape, bool)

@@ -101,7 +101,7 @@ class _StripView:
 
     def cues(self, rows: slice, threads: int) -> tuple[_StripCues, _StripCues]:
         """Return the cues of both images for `upsample_kernels.match`."""
-        from stereoweave.matching import upsample_kernels as kernels  # Numba takes half a second to import
+        from stereoweave.matching import upsample_kernels as kernels  # it loads LLVM
 
         with ThreadPoolExecutor(threads) as pool:
             own, other = pool.map(lambda grey: _cues(grey, rows), (self.grey, self.other))
@@ -165,7 +165,7 @@ def enlarge(
 
 
 def rehearse_upsampling() -> None:
-    """Upsample a small estimate, to compile all kernels (`kernel_cache.compile_ahead`)."""
+    """Upsample a small estimate, to compile all kernels (`compiling_ahead.compile_ahead`)."""
     image, px = np.zeros((64, 64, 3), np.uint8), np.zeros((32, 32), np.float32)
     enlarge(image, image, Estimate(disparity_px=px, right_disparity_px=px, confidence=px, occluded=px > 0), 1)
 

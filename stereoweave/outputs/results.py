@@ -46,7 +46,9 @@ from stereoweave.outputs.report import Context, Summary, write_report
 from stereoweave.outputs.report_parts import CONTENTS
 from stereoweave.outputs.run import Result, run
 from stereoweave.pictures.prepare import Request, prepare
+from stereoweave.rendering.rehearsals import rehearse_drawing, rehearse_filling
 from stereoweave.stereo import StereoPair
+from stereoweave.system.compiling_ahead import compile_ahead
 from stereoweave.system.steps import step
 
 
@@ -90,6 +92,7 @@ FILES: dict[str, Callable[[Path, Result], None]] = {
 }
 ALWAYS = ("disparity.pfm", "disparity.png", "preview.png", "confidence.png", "occluded.png", "report.html")
 ALL = "all"
+REPORT = "report.html"
 SCALED = "disparity_scaled.png"
 
 
@@ -129,6 +132,8 @@ def make_depth(pictures: Sequence[Path], out: Path, job: DepthJob) -> tuple[Summ
     matcher = job.backend.matcher()
     prepared = prepare(pictures, job.request)
     files, left_out = _choose_files(job, prepared.pair)
+    if REPORT in files:
+        compile_ahead(rehearse_drawing, rehearse_filling)
     with _write_together(out) as folder:
         result = run(prepared, matcher, job.options)
         result = replace(result, command=job.command, name_of=job.name_of)

@@ -24,9 +24,11 @@ from stereoweave.rendering.layouts import (
     render_views,
     write_picture,
 )
+from stereoweave.rendering.rehearsals import rehearse_drawing, rehearse_filling, rehearse_moving
 from stereoweave.rendering.renderer import Renderer, check_position
 from stereoweave.rendering.scaling import fit_size, scale_down
 from stereoweave.stereo import Estimate, StereoPair
+from stereoweave.system.compiling_ahead import Rehearsal
 from stereoweave.system.steps import step
 
 
@@ -75,6 +77,19 @@ class ViewFile:
         if self.name == VIEWER:
             return POSITIONS
         return LAYOUTS[self.name].positions if self.name in LAYOUTS else ANIMATIONS[self.name].positions
+
+    @property
+    def rehearsals(self) -> list[Rehearsal]:
+        """Rehearsals that compile the kernels of this file's views."""
+        if self.name == "rgbd":
+            return []
+        outside = any(self.strength * abs(position - 0.5) > 0.5 for position in self._positions)
+        needed = {
+            rehearse_drawing: self.name != VIEWER,
+            rehearse_filling: outside or self.name == VIEWER,
+            rehearse_moving: bool(self.up or self.forward),
+        }
+        return [rehearse for rehearse, is_needed in needed.items() if is_needed]
 
     @property
     def _is_overlaid(self) -> bool:

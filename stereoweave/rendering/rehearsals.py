@@ -1,4 +1,4 @@
-"""Rehearsals of view synthesis, which compile its kernels (`kernel_cache.compile_ahead`).
+"""Rehearsals of view synthesis, which compile its kernels (`compiling_ahead.compile_ahead`).
 
 There are two, for two processes: `rehearse_drawing` compiles the kernel `draw`, which takes longer to compile
 than all others together.
@@ -26,6 +26,11 @@ def rehearse_filling() -> None:
     canvas = empty_canvas(background.colours)
     paint_background(*background, 0.0, 0.0, canvas)
     fill(canvas)
+
+
+def rehearse_moving() -> None:
+    """Render a small view from above the line through the cameras."""
+    _renderer().view(0.5, up=0.5)
 
 
 def _renderer() -> Renderer:

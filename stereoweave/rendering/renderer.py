@@ -95,7 +95,7 @@ class Renderer:
     def _draw(self, position: float) -> "Canvas":
         """Render the view from a position on the line through the cameras, with holes filled."""
         from stereoweave.rendering.canvas_kernels import empty_canvas
-        from stereoweave.rendering.draw_kernels import draw  # Numba takes half a second to import
+        from stereoweave.rendering.draw_kernels import draw  # it loads LLVM
         from stereoweave.rendering.hole_filling_kernels import fill, paint_background
 
         # The square root makes the weights of both images more equal, which lowers noise: +0.03 dB on

@@ -1,30 +1,17 @@
-"""The folder of compiled kernels, and processes that fill it ahead of their use.
-
-Compiling takes seconds, once on each machine, and occupies one core. A command starts other processes that
-compile what it needs, while it reads its input. This module imports no Numba, so that they start soon.
-"""
+"""The folder of compiled kernels, in which each kernel is compiled by one process at a time."""
 
 import functools
-import gc
 import hashlib
-import multiprocessing
 import os
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from contextvars import ContextVar
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext, suppress
 from importlib.metadata import version
-from multiprocessing.context import SpawnProcess
 from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from stereoweave.system.processes import begin_work
 from stereoweave.system.steps import step
-from stereoweave.system.threads import usable_cores
-
-Rehearsal = Callable[[], None]
-"""Function that calls kernels with small arguments, and so compiles them."""
 
 
 def cache_folder() -> Path:
@@ -51,15 +38,20 @@ def kernels_folder() -> Path:
 
 
 @contextmanager
-def compile_once(kernel: str) -> Iterator[None]:
-    """Load or compile a kernel in the block, while no other process compiles it.
+def compile_once(kernel: str, code: str) -> Iterator[None]:
+    """Load or compile a kernel in the block, while no other process or thread compiles it.
 
-    Compiling is announced as a step, as it takes seconds.
+    Compiling, and waiting for who compiles, is announced as a step, as it takes seconds.
+
+    Args:
+        kernel: Name of the kernel.
+        code: Pattern of the name of its compiled code, in the folder of kernels.
     """
     try:
         file = kernels_folder() / f"{kernel}.lock"
         file.parent.mkdir(parents=True, exist_ok=True)
-        is_first = not file.exists()
+        # Not whether the lock's file exists, because a killed process leaves it behind.
+        is_first = not any(file.parent.glob(code))
         lock = FileLock(file, fallback_to_soft=False)
         with suppress(Timeout):
             lock.acquire(blocking=False)
@@ -69,65 +61,15 @@ def compile_once(kernel: str) -> Iterator[None]:
             yield
         return
     try:
-        if is_first or not lock.is_locked:
-            with step(_COMPILING):
+        with step(_COMPILING) if is_first else nullcontext():
+            if not lock.is_locked:
                 lock.acquire()
-                yield
-        else:
             yield
     finally:
         lock.release()
 
 
-@contextmanager
-def compiling_ahead() -> Iterator[None]:
-    """Let `compile_ahead` start processes within the block; those still at work at its end are stopped."""
-    started: _Started = {}
-    token = _started.set(started)
-    try:
-        yield
-    finally:
-        _started.reset(token)
-        for process in started.values():
-            process.terminate()
-            process.join()
-
-
-def compile_ahead(*rehearsals: Rehearsal) -> None:
-    """Start a process for each rehearsal that no process has finished on this machine.
-
-    Nothing happens outside `compiling_ahead`, because a library must not start processes unasked, and nothing
-    on a single core, which is faster without.
-    """
-    started = _started.get()
-    if started is None or usable_cores() == 1:
-        return
-    for rehearse in rehearsals:
-        with suppress(OSError, RuntimeError):  # without a folder, the kernels cannot be handed over
-            kernels_folder().mkdir(parents=True, exist_ok=True)
-            if rehearse not in started and not _finished(rehearse).exists():
-                context = multiprocessing.get_context("spawn")
-                started[rehearse] = process = context.Process(target=_hold, args=[rehearse], daemon=True)
-                process.start()
-
-
 _COMPILING = "compiling, once on this machine"
-_Started = dict[Rehearsal, SpawnProcess]
-_started: ContextVar[_Started | None] = ContextVar("processes that compile", default=None)
-
-
-def _hold(rehearse: Rehearsal) -> None:
-    """Hold a rehearsal in a process of its own, and note its end in the cache."""
-    begin_work(threads=1)
-    gc.disable()  # it would take a tenth of the time
-    with suppress(Exception):  # the command itself meets the error, and explains it
-        rehearse()
-        _finished(rehearse).touch()
-
-
-def _finished(rehearse: Rehearsal) -> Path:
-    """Return the file that notes the end of a rehearsal."""
-    return kernels_folder() / f"{rehearse.__module__}.{rehearse.__qualname__}.finished"
 
 
 @functools.cache

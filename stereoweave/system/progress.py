@@ -1,5 +1,6 @@
 """Progress shown in a terminal: the number of finished items, or the step of a command."""
 
+import os
 import sys
 import threading
 import time
@@ -30,11 +31,18 @@ _EARLY_STEPS = 2
 
 
 def progress(console: Console) -> Progress:
-    """Return a progress bar; its tasks must have the fields `loss` and `rate`."""
+    """Return a progress bar that stays; its tasks must have the fields `loss` and `rate`.
+
+    It continues the line of `show_steps`: the description at once, and the rest a second after the command's
+    start.
+    """
+    start_s = time.monotonic()
     if display := _display.get():
+        start_s = display.start_s
         display.close()  # a terminal has room for one of them
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    return Progress(*columns, TextColumn("{task.fields[loss]} {task.fields[rate]}"), console=console)
+    fields = TextColumn("{task.fields[loss]} {task.fields[rate]}")
+    late = (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), fields)
+    return Progress(_name_column(), *(_Late(column, start_s) for column in late), console=console)
 
 
 @contextmanager
@@ -42,8 +50,12 @@ def show_steps() -> Iterator[None]:
     """Show on stderr the steps (`steps.step`) of the block.
 
     In a terminal: a line at once, and a bar after a second; both vanish after the last step. Elsewhere, such
-    as in a log: a plain line for each step that takes long.
+    as in a log: a plain line for each step that takes long. Nothing in a distributed run, but in its first
+    process.
     """
+    if os.environ.get("RANK", "0") != "0":
+        yield
+        return
     console = Console(stderr=True)
     display = _Line(console) if console.is_terminal and not console.is_dumb_terminal else _Lines(console)
     token = _display.set(display)
@@ -68,7 +80,7 @@ class _Line:
     """A line in a terminal that shows the current step; a listener."""
 
     def __init__(self, console: Console) -> None:
-        self._console, self._start_s = console, time.monotonic()
+        self._console, self.start_s = console, time.monotonic()
         self._bar: Progress | None = None
 
     def __call__(self, step: Step | None) -> None:
@@ -91,8 +103,8 @@ class _Line:
 
     def _open(self) -> Progress:
         return Progress(
-            TextColumn("{task.description} …"),
-            _Late(BarColumn(), self._start_s),
+            _name_column(),
+            _Late(BarColumn(), self.start_s),
             console=self._console,
             transient=True,
             # The command's answer on stdout may go to a file: leave it alone, unless both are the terminal.
@@ -100,8 +112,12 @@ class _Line:
         )
 
 
+def _name_column() -> ProgressColumn:
+    return TextColumn("{task.description} …")
+
+
 class _Late(ProgressColumn):
-    """A column that is empty until a second after the start."""
+    """A column that is empty until a second after the start, or until the end."""
 
     def __init__(self, column: ProgressColumn, start_s: float) -> None:
         super().__init__()
@@ -109,7 +125,7 @@ class _Late(ProgressColumn):
 
     def render(self, task: Task) -> RenderableType:
         """Return the column, or nothing."""
-        if time.monotonic() - self._start_s < _BAR_AFTER_S:
+        if time.monotonic() - self._start_s < _BAR_AFTER_S and not task.finished:
             return Text()
         return self._column.render(task)
 
@@ -118,7 +134,7 @@ class _Lines:
     """Plain lines, for logs; a listener."""
 
     def __init__(self, console: Console) -> None:
-        self._console = console
+        self._console, self.start_s = console, time.monotonic()
         self._name = ""
         self._known = set[str]()
         self._printed_s = -_LINE_EVERY_S

@@ -1,4 +1,3 @@
-import multiprocessing
 import os
 import signal
 import subprocess
@@ -8,70 +7,23 @@ from contextvars import copy_context
 
 import pytest
 
-from stereoweave.system import kernel_cache
-from stereoweave.system.kernel_cache import compile_ahead, compile_once, compiling_ahead, kernels_folder
+from stereoweave.system.kernel_cache import compile_once, kernels_folder
 from stereoweave.system.steps import listening
-
-# Its tests would need a function that waits forever and that another process can import.
-pytestmark = pytest.mark.skipif(not hasattr(signal, "pause"), reason="Windows cannot wait for a signal")
 
 
 @pytest.fixture(autouse=True)
-def two_cores_and_no_kernels(tmp_path, monkeypatch):
+def no_kernels(tmp_path, monkeypatch):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kernels"))
-    monkeypatch.setattr(kernel_cache, "usable_cores", lambda: 2)
-
-
-REHEARSED = """
-import multiprocessing
-from stereoweave.matching import refine_kernels as kernels
-from stereoweave.matching.refine import rehearse_refining
-from stereoweave.system import kernel_cache
-kernel_cache.usable_cores = lambda: 2
-with kernel_cache.compiling_ahead():
-    kernel_cache.compile_ahead(rehearse_refining)
-    [process.join() for process in multiprocessing.active_children()]
-rehearse_refining()
-print(kernels.census.loads, kernels.match.loads, kernels.along_rows.loads, kernels.extend.loads)
-with kernel_cache.compiling_ahead():
-    kernel_cache.compile_ahead(rehearse_refining)
-    print(multiprocessing.active_children())
-"""
-
-
-def test_kernels_are_loaded_that_another_process_compiled_and_compiled_ahead_once():
-    done = subprocess.run([sys.executable, "-c", REHEARSED], capture_output=True, text=True, check=True)
-    assert (done.stdout, done.stderr) == ("1 1 1 1\n[]\n", "")
-
-
-def test_a_library_starts_no_process():
-    compile_ahead(signal.pause)
-    assert multiprocessing.active_children() == []
-
-
-def test_a_single_core_compiles_nothing_ahead(monkeypatch):
-    monkeypatch.setattr(kernel_cache, "usable_cores", lambda: 1)
-    with compiling_ahead():
-        compile_ahead(signal.pause)
-        assert multiprocessing.active_children() == []
-
-
-def test_a_command_leaves_no_process_behind():
-    with compiling_ahead():
-        compile_ahead(signal.pause)
-        compile_ahead(signal.pause)
-        assert len(multiprocessing.active_children()) == 1
-    assert multiprocessing.active_children() == []
 
 
 def test_a_kernel_waits_while_it_is_compiled_elsewhere():
     waits, order = threading.Event(), []
 
     def load():
-        with listening(lambda step: waits.set()), compile_once("slow"):
+        with listening(lambda step: waits.set()), compile_once("slow", "slow.o"):
             order.append("loaded")
 
-    with compile_once("slow"):
+    with compile_once("slow", "slow.o"):
         thread = threading.Thread(target=copy_context().run, args=[load])
         thread.start()
         assert waits.wait(60)
@@ -83,21 +35,37 @@ def test_a_kernel_waits_while_it_is_compiled_elsewhere():
 def test_only_the_first_compilation_is_announced():
     told = []
     with listening(told.append):
-        with compile_once("one"):
+        with compile_once("one", "one.*.o"):
             assert [step.name for step in told] == ["compiling, once on this machine"]
+            (kernels_folder() / "one.0123.o").write_bytes(b"")
         told.clear()
-        with compile_once("one"):
+        with compile_once("one", "one.*.o"):
             pass
     assert told == []
+
+
+KILLED = """
+import os, signal
+from stereoweave.system.kernel_cache import compile_once
+with compile_once("one", "one.o"):
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="Windows has no such signal")
+def test_the_lock_of_a_killed_process_is_no_proof_of_a_compiled_kernel():
+    done = subprocess.run([sys.executable, "-c", KILLED])
+    assert done.returncode == -signal.SIGKILL
+    assert (kernels_folder() / "one.lock").exists()
+    told = []
+    with listening(told.append), compile_once("one", "one.o"):
+        assert [step.name for step in told] == ["compiling, once on this machine"]
 
 
 def test_without_a_writable_folder_kernels_are_compiled_all_the_same(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file"))
-    with compiling_ahead():
-        compile_ahead(signal.pause)
-        assert multiprocessing.active_children() == []
-    with pytest.raises(ZeroDivisionError), compile_once("one"):
+    with pytest.raises(ZeroDivisionError), compile_once("one", "one.o"):
         raise ZeroDivisionError
 
 
@@ -107,3 +75,20 @@ def test_the_folder_is_the_user_s_unless_numba_s_variable_names_another(tmp_path
     if os.name == "posix" and sys.platform != "darwin":
         monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
         assert kernels_folder().parent == tmp_path / "stereoweave" / "kernels"
+
+
+def test_waiting_for_a_process_that_loads_a_kernel_is_not_announced():
+    told, order = [], []
+    with compile_once("one", "one.o"):
+        (kernels_folder() / "one.o").write_bytes(b"")
+
+        def load():
+            with listening(told.append), compile_once("one", "one.o"):
+                order.append("loaded")
+
+        thread = threading.Thread(target=load)
+        thread.start()
+        thread.join(0.1)
+        order.append("known")
+    thread.join()
+    assert (told, order) == ([], ["known", "loaded"])

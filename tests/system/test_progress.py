@@ -102,3 +102,57 @@ def test_an_error_in_the_input_is_the_only_line_of_a_log(pair):
     done = subprocess.run(command("depth left.png missing.png -o out"), capture_output=True, text=True)
     (line,) = done.stderr.splitlines()
     assert line.startswith("stereoweave: missing.png: ")
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "batch missing out",
+        "bench pairs missing",
+        "calibrate missing -o rig.yml --board 9x6 --square-mm 20",
+        "export missing -o out.onnx",
+        "synth check missing",
+        "synth make rooms --pairs 1 --size 1x1 -o set",
+        "train missing -o run",
+    ],
+)
+def test_each_long_command_says_something_at_once(line, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code, printed, got = in_terminal(line)
+    assert (code, printed) == (2, "")
+    assert got.startswith("\x1b[?25lstarting …")
+    assert got.rpartition("\x1b[2K")[2].startswith("stereoweave: ")
+
+
+def test_a_distributed_run_shows_the_steps_of_its_first_process(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("RANK", "1")
+    code, printed, got = in_terminal("train missing -o run")
+    assert (code, printed) == (2, "")
+    assert "starting" not in got
+
+
+BAR = """
+import time
+from rich.console import Console
+from stereoweave.system.progress import progress, show_steps
+seconds = [100.0]
+time.monotonic = lambda: seconds[0]
+console = Console(width=80, file=open("shown.txt", "w"))
+with show_steps():
+    bar = progress(console)
+    task = bar.add_task("making pairs", total=4, loss="1 failed", rate="2.0 pairs/s")
+    for seconds[0] in (100.9, 101.1):
+        console.print(bar.get_renderable())
+    seconds[0] = 100.9
+    bar.advance(task, 4)
+    console.print(bar.get_renderable())
+"""
+
+
+def test_a_bar_follows_its_description_a_second_after_the_start_or_at_the_end(tmp_path):
+    subprocess.run([sys.executable, "-c", BAR], cwd=tmp_path, check=True)
+    early, late, end = (tmp_path / "shown.txt").read_text("utf-8").splitlines()
+    assert early.strip() == "making pairs …"
+    assert late.rstrip().endswith("0/4 -:--:-- 1 failed 2.0 pairs/s")
+    assert end.startswith("making pairs … ━━━") and "4/4" in end

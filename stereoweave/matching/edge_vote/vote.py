@@ -53,7 +53,7 @@ def vote_at_edges(
 
 
 def rehearse_voting() -> None:
-    """Vote on a small estimate, to compile the kernel (`kernel_cache.compile_ahead`)."""
+    """Vote on a small estimate, to compile the kernel (`compiling_ahead.compile_ahead`)."""
     image, px = np.zeros((32, 32, 3), np.uint8), np.zeros((32, 32), np.float32)
     estimate = Estimate(disparity_px=px, right_disparity_px=px, confidence=px, occluded=px > 0)
     vote_at_edges(image, estimate, 1)
@@ -63,7 +63,7 @@ def _vote(
     image: UInt8[np.ndarray, "h w 3"], estimate: Estimate, threads: int | None
 ) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
     """Return the disparities and confidences after all rounds."""
-    from stereoweave.matching.edge_vote.vote_kernels import vote  # Numba takes half a second to import
+    from stereoweave.matching.edge_vote.vote_kernels import vote  # it loads LLVM
 
     lab = cv2.cvtColor(image.astype(np.float32) / 255, cv2.COLOR_RGB2LAB)
     disparity_px = np.array(estimate.disparity_px, np.float32)
