@@ -125,8 +125,9 @@ def _compile() -> Iterator[Any]:
     from stereoweave.matching.upsample import rehearse_upsampling
     from stereoweave.rendering.rehearsals import rehearse_drawing, rehearse_filling, rehearse_moving
     from stereoweave.system.jit import Kernel
+    from stereoweave.video.carried_frames import rehearse_carrying
 
-    for rehearse in (rehearse_refining, rehearse_voting, rehearse_upsampling):
+    for rehearse in (rehearse_refining, rehearse_voting, rehearse_upsampling, rehearse_carrying):
         rehearse()
     for rehearse in (rehearse_drawing, rehearse_filling, rehearse_moving):
         rehearse()

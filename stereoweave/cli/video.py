@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stereoweave.cli.commands import running_options
+from stereoweave.cli.commands import running_options, shows_steps
 from stereoweave.cli.options import (
     Model,
     OldFormat,
@@ -107,6 +107,7 @@ RectifyShots = Annotated[
 ]
 
 
+@shows_steps
 def video(  # noqa: PLR0913 - each is an option of the command line
     videos: Videos,
     out: Out,

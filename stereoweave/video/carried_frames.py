@@ -19,7 +19,8 @@ from stereoweave.video.carried_kernels import Source, take_pixels
 from stereoweave.video.frame_groups import FrameGroup
 from stereoweave.video.motion import convert_to_grey, find_flow, halve
 from stereoweave.video.reader import StereoFrame
-from stereoweave.video.temporal_filter import FilteredFrame, TemporalFilter, Track
+from stereoweave.video.temporal_filter import FilteredFrame, TemporalFilter
+from stereoweave.video.temporal_kernels import Track
 
 # A window's pixel weighs less, the more its grey level differs from the centre's, because it may then belong
 # to another surface (K.-J. Yoon and I. S. Kweon, "Adaptive Support-Weight Approach for Correspondence
@@ -68,6 +69,18 @@ def carry_between(
     shares = [number / (len(pairs) + 1) for number in range(1, len(pairs) + 1)]
     with ThreadPoolExecutor(min(threads, len(pairs))) as pool:
         return list(pool.map(_carry, pairs, repeat(before), repeat(after), shares))
+
+
+def rehearse_carrying() -> None:
+    """Carry depth between small frames, to compile all kernels (`compiling_ahead.compile_ahead`)."""
+    image, px = np.zeros((32, 32, 3), np.uint8), np.zeros((32, 32), np.float32)
+    pair, temporal_filter = StereoPair(left=image, right=image), TemporalFilter(1)
+    estimate = Estimate(disparity_px=px, right_disparity_px=px, confidence=px, occluded=px > 0)
+    matched = []
+    for _ in range(2):
+        temporal_filter(pair.left, pair.right, estimate)
+        matched.append(temporal_filter.last)
+    carry_between([pair], matched[0], matched[1], 1)
 
 
 def _carry(pair: StereoPair, before: FilteredFrame, after: FilteredFrame, share: float) -> Estimate:

@@ -5,7 +5,7 @@ import typing
 import numpy as np
 
 from stereoweave.system.jit import inlined, kernel
-from stereoweave.video.temporal_filter import SAME_PX, SAME_SHARE
+from stereoweave.video.temporal_kernels import SAME_PX, SAME_SHARE
 
 RADIUS_PX = 3
 """Greatest distance of a window's pixels from its centre, along rows and columns."""

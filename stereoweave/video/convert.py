@@ -14,8 +14,11 @@ from rich.progress import Progress
 from stereoweave import __version__
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.output_lock import lock_output
+from stereoweave.rendering.rehearsals import rehearse_drawing, rehearse_filling
+from stereoweave.system.compiling_ahead import compile_ahead
 from stereoweave.system.progress import progress
 from stereoweave.system.threads import thread_count
+from stereoweave.video.carried_frames import rehearse_carrying
 from stereoweave.video.frame_converter import FrameConverter, VideoTally, load_matcher
 from stereoweave.video.job import VideoJob
 from stereoweave.video.parts import open_parts
@@ -59,6 +62,9 @@ def convert_video(
     """
     _check_output(out, job, video, sources)
     matcher = load_matcher(job)
+    compile_ahead(
+        rehearse_carrying, *(() if job.depth or job.depth16 else (rehearse_drawing, rehearse_filling))
+    )
     recorder = Recorder(
         encoding=GREY16 if job.depth16 else H264,
         time_base=video.time_base,

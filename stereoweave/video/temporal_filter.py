@@ -19,36 +19,12 @@ from jaxtyping import Bool, Float, UInt8
 
 from stereoweave.errors import StereoweaveError
 from stereoweave.stereo import Estimate
-from stereoweave.system.jit import kernel
 from stereoweave.system.threads import thread_count
 from stereoweave.video.motion import CUT_SHARE, Motion, convert_to_grey, halve, measure_motion
-
-MOST_FRAMES = 12.0
-"""Maximum number of frames in a mean. The limit lets the mean follow slow changes."""
-SAME_PX, SAME_SHARE = 1.0, 0.02
-"""Frames show the same surface if their disparities differ by at most SAME_PX + SAME_SHARE * disparity."""
-NEIGHBOUR_PX = 3.0
-"""Neighbours belong to the same surface if their disparities differ by less than this."""
-STEP_PX, STEPS = 8, 2
-"""Spacing of the grid of sampled neighbours, and the number of steps in each direction."""
+from stereoweave.video.temporal_kernels import SAME_PX, SAME_SHARE, Track, blend, carry, measure_drift
 
 # If at least this share of the image is at rest, a majority of contradictions cannot be due to chance.
 _LEAST_ASKED_SHARE = 0.25
-
-
-class Track(typing.NamedTuple):
-    """Filtered state of one view; arrays are float32 [H, W].
-
-    Attributes:
-        disparity_px: Mean disparity over the frames.
-        confidence: Mean confidence; a frame that contradicts the mean counts as 0.
-        frames: Number of frames in the mean, minus the number that contradicted the mean afterwards; 0 where
-            the disparity is unknown.
-    """
-
-    disparity_px: np.ndarray
-    confidence: np.ndarray
-    frames: np.ndarray
 
 
 class FilteredFrame(typing.NamedTuple):
@@ -218,97 +194,3 @@ def _update(new: Track, expected: Expectation) -> Track:
     mean = Track(*(np.empty_like(values) for values in new))
     blend(new, expected.carried, expected.calm, expected.drift_px, mean)
     return mean
-
-
-@kernel
-@typing.no_type_check
-def carry(new_px, track, motion, carried):
-    """Warp `track` to the new frame and write it to `carried`, with 0 frames where nothing is known.
-
-    Motion is not accurate to the pixel. Outside calm areas, each pixel therefore takes its value from
-    whichever of the nine pixels around its previous position has the disparity closest to `new_px` [H, W].
-    """
-    old_px, old_confidence, old_frames = track.disparity_px, track.confidence, track.frames
-    disparity_px, confidence, frames = carried.disparity_px, carried.confidence, carried.frames
-    to_before_px, explained, calm = motion.to_before_px, motion.explained, motion.calm
-    height, width = new_px.shape
-    for y in range(height):
-        for x in range(width):
-            i, j = y // 2, x // 2
-            disparity_px[y, x] = confidence[y, x] = frames[y, x] = 0.0
-            row = int(round(y + to_before_px[i, j, 1]))
-            column = int(round(x + to_before_px[i, j, 0]))
-            if not explained[i, j] or row < 0 or row >= height or column < 0 or column >= width:
-                continue
-            if not calm[i, j]:
-                middle_row, middle_column = row, column
-                # A neighbour must be clearly better than the centre, so that noise does not shift the map
-                # back and forth.
-                least_px = abs(old_px[row, column] - new_px[y, x]) - 0.5
-                for near_row in range(max(middle_row - 1, 0), min(middle_row + 2, height)):
-                    for near_column in range(max(middle_column - 1, 0), min(middle_column + 2, width)):
-                        apart_px = abs(old_px[near_row, near_column] - new_px[y, x])
-                        if apart_px < least_px:
-                            least_px = apart_px
-                            row, column = near_row, near_column
-            disparity_px[y, x] = old_px[row, column]
-            confidence[y, x] = old_confidence[row, column]
-            frames[y, x] = old_frames[row, column]
-
-
-@kernel
-@typing.no_type_check
-def measure_drift(new_px, carried, drift_px):
-    """Write the disparity change of the surface around every second pixel to `drift_px` [H2, W2].
-
-    The result is the mean change in the neighbourhood, shrunk by the James-Stein estimator: the mean times
-    1 - (standard error / mean) ** 2, or 0 where that factor is negative.
-    """
-    old_px, frames = carried.disparity_px, carried.frames
-    height, width = new_px.shape
-    for i in range(drift_px.shape[0]):
-        for j in range(drift_px.shape[1]):
-            here_px = new_px[2 * i, 2 * j]
-            total_px = total_px2 = 0.0
-            count = 0
-            for y in range(2 * i - STEPS * STEP_PX, 2 * i + STEPS * STEP_PX + 1, STEP_PX):
-                for x in range(2 * j - STEPS * STEP_PX, 2 * j + STEPS * STEP_PX + 1, STEP_PX):
-                    if 0 <= y < height and 0 <= x < width and frames[y, x] > 0:
-                        change_px = new_px[y, x] - old_px[y, x]
-                        if abs(change_px) < NEIGHBOUR_PX and abs(new_px[y, x] - here_px) < NEIGHBOUR_PX:
-                            total_px += change_px
-                            total_px2 += change_px * change_px
-                            count += 1
-            drift_px[i, j] = 0.0
-            if count > 1:
-                mean_px = total_px / count
-                doubt_px2 = (total_px2 / count - mean_px**2) / (count - 1)
-                if mean_px**2 > doubt_px2:
-                    drift_px[i, j] = mean_px - doubt_px2 / mean_px
-
-
-@kernel
-@typing.no_type_check
-def blend(new, carried, calm, drift_px, mean):
-    """Combine `carried` with the new frame, and write the updated track to `mean`."""
-    new_px, new_confidence = new.disparity_px, new.confidence
-    old_px, old_confidence, old_frames = carried.disparity_px, carried.confidence, carried.frames
-    disparity_px, confidence, frames = mean.disparity_px, mean.confidence, mean.frames
-    height, width = new_px.shape
-    for y in range(height):
-        for x in range(width):
-            expected_px = old_px[y, x] + drift_px[y // 2, x // 2]
-            apart_px = new_px[y, x] - expected_px
-            count = old_frames[y, x]
-            if count > 0 and abs(apart_px) > SAME_PX + SAME_SHARE * abs(new_px[y, x]):
-                if calm[y // 2, x // 2]:
-                    disparity_px[y, x] = expected_px
-                    confidence[y, x] = old_confidence[y, x] * count / (count + 1.0)
-                    frames[y, x] = count - 1.0
-                    continue
-                count = 0.0
-            count = min(count + 1.0, MOST_FRAMES)
-            share = 1.0 / count
-            disparity_px[y, x] = new_px[y, x] - (1.0 - share) * apart_px
-            confidence[y, x] = old_confidence[y, x] + share * (new_confidence[y, x] - old_confidence[y, x])
-            frames[y, x] = count

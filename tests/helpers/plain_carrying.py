@@ -3,7 +3,7 @@
 import numpy as np
 
 from stereoweave.video.carried_kernels import MOST_LEVELS, RADIUS_PX
-from stereoweave.video.temporal_filter import SAME_PX, SAME_SHARE
+from stereoweave.video.temporal_kernels import SAME_PX, SAME_SHARE
 
 
 def _window(image, row, column):

@@ -9,14 +9,14 @@ import pytest
 from stereoweave.errors import StereoweaveError
 from stereoweave.stereo import Estimate
 from stereoweave.video.motion import Motion
-from stereoweave.video.temporal_filter import (
+from stereoweave.video.temporal_filter import TemporalFilter
+from stereoweave.video.temporal_kernels import (
     MOST_FRAMES,
     NEIGHBOUR_PX,
     SAME_PX,
     SAME_SHARE,
     STEP_PX,
     STEPS,
-    TemporalFilter,
     Track,
     blend,
     carry,
