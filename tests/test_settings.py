@@ -34,8 +34,8 @@ SHARED = {"cameras", "matching", "outputs", "pictures", "rendering"}
 # Settings of these subpackages that the page and the service do not offer.
 ABSENT = {
     "page": {
-        *("align", "board", "convergence_px", "crop", "files", "forward", "layout", "left", "listed", "out"),
-        *("position", "provider", "range_px", "raw", "refined", "right", "strength", "up"),
+        *("align", "board", "convergence_px", "files", "forward", "layout", "left", "listed", "out"),
+        *("provider", "range_px", "raw", "refined", "right", "strength", "up"),
     },
     "service": {
         *("align", "board", "convergence_px", "crop", "files", "forward", "layout", "left", "listed"),

@@ -28,7 +28,7 @@ class Wording:
         return [self._format_line(note.format(self._name_of)) for note in notes]
 
     def _format_line(self, line: str) -> str:
-        return re.sub(rf"{re.escape(str(self._folder))}/\w+/", "", " ".join(line.splitlines()))
+        return re.sub(rf"{re.escape(str(self._folder))}/(\w+/)+", "", " ".join(line.splitlines()))
 
 
 def name_setting(labels: dict[str, str], setting: str) -> str | None:

@@ -17,8 +17,8 @@ from stereoweave.pictures.sample import sample_folder
 _DETECTED = "detected"
 MODELS = [("fast", "small"), ("fine", "base"), ("finest", "best")]
 
-# Labels of the form's fields, by setting.
-_LABELS = {
+# Labels of the fields for a pair, by setting.
+LABELS = {
     "format": "Layout of a single file",
     "baseline_m": "Baseline, mm",
     "calibration": "Calibration file, for metres",
@@ -26,8 +26,10 @@ _LABELS = {
     "model": "Quality",
     "rectify": "Align the pictures",
     "no_rectify": "Align the pictures",
+    "crop": "Cut off borders",
+    "position": "Viewpoint",
 }
-label_of = partial(name_setting, _LABELS)
+label_of = partial(name_setting, LABELS)
 
 
 class PairForm:
@@ -38,23 +40,23 @@ class PairForm:
         self.right = gr.File(label="Right picture", height=160, elem_id="right")
         self.rectify = gr.Checkbox(
             value=True,
-            label=_LABELS["rectify"],
+            label=LABELS["rectify"],
             info="Only where needed, as in pictures taken by hand; not with focal length and baseline.",
             elem_id="rectify",
         )
         self.model = gr.Radio(
             MODELS,
             value="best",
-            label=_LABELS["model"],
+            label=LABELS["model"],
             info="Finer takes longer: fine 2 times, finest 5 times.",
             elem_id="model",
         )
         with gr.Accordion("More about the pictures", open=False):
-            self.layout = make_layout_choice(_LABELS["format"], FORMATS, "layout")
-            self.calibration = gr.File(label=_LABELS["calibration"], height=140, elem_id="calibration")
+            self.layout = make_layout_choice(LABELS["format"], FORMATS, "layout")
+            self.calibration = gr.File(label=LABELS["calibration"], height=140, elem_id="calibration")
             with gr.Row():
-                self.focal_px = _make_optional_number(_LABELS["focal_px"], "focal")
-                self.baseline_mm = _make_optional_number(_LABELS["baseline_m"], "baseline")
+                self.focal_px = _make_optional_number(LABELS["focal_px"], "focal")
+                self.baseline_mm = _make_optional_number(LABELS["baseline_m"], "baseline")
         self.find = gr.Button("Find depth", variant="primary", elem_id="find")
         self.cancel = gr.Button("Cancel", variant="stop", interactive=False, elem_id="cancel")
         self.sample = gr.Button("Try the sample", elem_id="sample")

@@ -19,7 +19,7 @@ from stereoweave.app.notices import (
     format_paragraphs,
     format_warnings,
 )
-from stereoweave.app.pair_form import PairForm, label_of
+from stereoweave.app.pair_form import LABELS, PairForm, label_of
 from stereoweave.app.session import (
     Session,
     colour_depth,
@@ -78,7 +78,7 @@ class PairTab:
             with gr.Tab("View", id="first"):
                 self._build_views()
             with gr.Tab("3-D picture") as self._picture_tab:
-                self._stereo = StereoPictureTab(self._host, self._wording)
+                self._stereo = StereoPictureTab(self._host, self._wording, self._session, self._position)
             with gr.Tab("3-D points") as self._cloud_tab:
                 gr.HTML(js_on_load=_WITHOUT_WEBGL, padding=False)
                 self._about_points = gr.HTML(elem_id="about-points")
@@ -103,7 +103,7 @@ class PairTab:
             1.5,
             value=0.5,
             step=0.05,
-            label="Viewpoint",
+            label=LABELS["position"],
             info="0 is the left camera, 1 the right one",
             buttons=[],
             elem_id="position",
@@ -136,7 +136,7 @@ class PairTab:
             )
             long += [found, written]
             ends.append(written.then)
-        made = self._stereo.connect(self._picture_tab, self._session, form.cancel)
+        made = self._stereo.connect(self._picture_tab, form.cancel)
         connect_cancel(form.cancel, self._status, [*long, *made])
         switch(form.cancel, [*ends, *(event.then for event in made)], on=False)
         self._connect_views()

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from stereoweave.app.stereo_pictures import StereoPicture, crop_both
+from stereoweave.app.stereo_pictures import StereoPicture, Wish, crop_both
 from stereoweave.errors import NameOf, Note, StereoweaveError, keyword
 from stereoweave.io.colormap import colour_disparity, find_colour_range_px
 from stereoweave.matching.backend import Backend
@@ -43,7 +43,7 @@ class Session:
         pair, estimate: Both at the size at which the page shows them.
         renderer: Renderer of views at that size, without the borders of an aligned pair.
         folder: Folder of the result's files.
-        stereo_pictures: The 3-D pictures made so far, by kind.
+        stereo_pictures: The 3-D pictures made so far.
     """
 
     result: Result
@@ -51,7 +51,7 @@ class Session:
     estimate: Estimate
     renderer: Renderer
     folder: Path
-    stereo_pictures: dict[str, StereoPicture] = field(default_factory=dict)
+    stereo_pictures: dict[Wish, StereoPicture] = field(default_factory=dict)
 
     @property
     def is_written(self) -> bool:

@@ -129,7 +129,7 @@ def view(  # noqa: PLR0913 - each is an option of the command line
     from stereoweave.matching.options import MatchOptions
     from stereoweave.outputs.view_files import ViewFile
     from stereoweave.pictures.prepare import prepare
-    from stereoweave.rendering.layouts import choose_layout
+    from stereoweave.rendering.layouts import choose_layout, is_converged
 
     out = out or _name_view(pictures, layout)
     name = choose_layout(out, layout)
@@ -142,7 +142,7 @@ def view(  # noqa: PLR0913 - each is an option of the command line
         up=up,
         forward=forward,
         strength=strength,
-        convergence_px=_parse_convergence_px(convergence or _default_convergence(name)),
+        convergence_px=_parse_convergence_px(convergence or ("auto" if is_converged(name) else "0")),
         layout_options=_parse_quilt(quilt),
         size_px=parse_largest_size_px(size),
         crops=_parse_crop(crop),
@@ -154,7 +154,8 @@ def view(  # noqa: PLR0913 - each is an option of the command line
     file = file.add_mark(pair)
     make_parent_folder(file.path)
     estimate = match(Backend(model=model, threads=threads, provider=provider).matcher(), pair, options)
-    typer.echo(f"{file.path}: {file.write(pair, estimate, prepared.pictures)}")
+    written = file.write(pair, estimate, prepared.pictures)
+    typer.echo(f"{file.path}: {written.description}")
     for note in (*prepared.notes, *find_problems(pair, estimate, prepared.alignment)):
         typer.echo(note.format(running_options()))
 
@@ -198,14 +199,6 @@ def _parse_quilt(quilt: str | None) -> "LayoutOptions":
     if match is None:
         raise StereoweaveError(f"--quilt: expected columns and rows, such as 8x6, found {quilt!r}")
     return LayoutOptions(columns=int(match[1]), rows=int(match[2]))
-
-
-def _default_convergence(name: str | None) -> str:
-    """Return the --convergence of a layout for which none is given."""
-    from stereoweave.rendering.layouts import LAYOUTS
-
-    parallel = name is None or (name in LAYOUTS and not LAYOUTS[name].converged)
-    return "0" if parallel else "auto"
 
 
 def _parse_crop(crop: str | None) -> bool:

@@ -19,10 +19,13 @@ from video_examples import example_pairs, packed, write_video
 
 from stereoweave.app.film import Film, convert_film
 from stereoweave.app.film_tab import label_of
-from stereoweave.app.stereo_pictures import KINDS
+from stereoweave.app.stereo_pictures import AUTOMATIC_PX, FULL_PX, KINDS, Wish, write_stereo_picture
 from stereoweave.errors import FormatError
 from stereoweave.io.images import read_image, write_image
 from stereoweave.matching.backend import Backend
+from stereoweave.matching.options import MatchOptions
+from stereoweave.outputs.run import Result, run
+from stereoweave.pictures.prepare import Request, prepare
 
 TEXTURED = Path(__file__).resolve().parents[1] / "textured_pair"
 WIDTH, HEIGHT = 320, 240
@@ -197,6 +200,7 @@ STILLS = {
     "contact_sheet": ("JPEG", (WIDTH // 3 * 3, HEIGHT // 3 * 3)),
     "rgbd": ("JPEG", (2 * WIDTH, HEIGHT)),
     "depth_map": ("PNG", (WIDTH, HEIGHT)),
+    "view": ("JPEG", (WIDTH, HEIGHT)),
 }
 FRAMES = {"wiggle": 12, "sweep": 80, "mpo": 2}
 
@@ -208,37 +212,120 @@ def answered(browser, server, pair) -> Iterator[Visit]:
         visit.give(**pair)
         visit.find()
         visit.open("3-D picture")
-        visit.page.locator("#picture").get_by_text("anaglyph_dubois").wait_for()
+        visit.page.locator("#picture").get_by_text("left_anaglyph_dubois").wait_for()
         yield visit
 
 
-@pytest.mark.parametrize("kind", KINDS)
+def make_picture(visit: Visit, kind: str, folder: Path) -> Path:
+    """Choose a kind of 3-D picture and download it."""
+    visit.choose("kind", KINDS[kind].label)
+    visit.page.locator("#viewing").get_by_text(KINDS[kind].viewing).wait_for()
+    visit.page.locator("#picture").get_by_text(f" left_{kind}").wait_for()
+    return visit.download("picture", folder)
+
+
+@pytest.mark.parametrize("kind", STILLS)
 def test_each_3_d_picture_opens_with_its_format_and_size(answered, kind, tmp_path):
-    answered.choose("kind", KINDS[kind].label)
-    answered.page.locator("#viewing").get_by_text(KINDS[kind].viewing).wait_for()
-    stem = "picture" if kind in ("mpo", "jps") else kind
-    answered.page.locator("#picture").get_by_text(f" {stem}").wait_for()
-    file = answered.download("picture", tmp_path)
-    with Image.open(file) as picture:
+    with Image.open(make_picture(answered, kind, tmp_path)) as picture:
         assert (picture.format, picture.size) == STILLS[kind]
         assert getattr(picture, "n_frames", 1) == FRAMES.get(kind, 1)
     assert answered.picture("preview").std() > 10
 
 
+def test_all_kinds_of_3_d_pictures_are_tested():
+    assert {*STILLS, "viewer"} == set(KINDS)
+
+
+def test_a_3_d_photo_moves_in_the_page_and_is_one_file(answered, tmp_path):
+    photo = make_picture(answered, "viewer", tmp_path)
+    (frame,) = answered.page.frames[1:]
+    frame.wait_for_function("Boolean(window.stereoweaveViewer)")
+    assert frame.evaluate("stereoweaveViewer.view.scene.size_px") == [WIDTH, HEIGHT]
+    assert not answered.page.locator("#preview").is_visible()
+    assert photo.name == "left_viewer.html"
+    shown = answered.page.locator("#photo iframe").get_attribute("srcdoc")
+    assert shown == photo.read_text(encoding="utf-8")
+
+
 @pytest.mark.parametrize("kind", ["wiggle", "sweep"])
-def test_an_animation_moves_in_its_preview(answered, kind):
-    answered.choose("kind", KINDS[kind].label)
-    answered.page.locator("#picture").get_by_text(f" {kind}").wait_for()
+def test_an_animation_moves_in_its_preview(answered, kind, tmp_path):
+    make_picture(answered, kind, tmp_path)
     with Image.open(io.BytesIO(answered.fetch("preview"))) as preview:
         assert getattr(preview, "n_frames", 1) == FRAMES[kind]
 
 
 def test_the_halves_of_a_crossed_picture_are_the_right_and_the_left_view(answered, pair, tmp_path):
-    answered.choose("kind", KINDS["crossed"].label)
-    answered.page.locator("#picture").get_by_text(" crossed").wait_for()
-    crossed = read_image(answered.download("picture", tmp_path)).astype(float)
+    crossed = read_image(make_picture(answered, "crossed", tmp_path)).astype(float)
     for side, half in zip(("right", "left"), np.split(crossed, 2, axis=1), strict=True):
         assert np.abs(half - read_image(pair[side])).mean() < 5
+
+
+def test_a_view_is_that_of_the_slider(answered, pair, tmp_path):
+    answered.move("1")
+    answered.open("3-D picture")
+    view = read_image(make_picture(answered, "view", tmp_path)).astype(float)
+    assert np.abs(view - read_image(pair["right"])).mean() < 5
+
+
+@pytest.fixture(scope="module")
+def result(pair) -> Result:
+    prepared = prepare(list(pair.values()), Request())
+    return run(prepared, Backend().matcher(), MatchOptions())
+
+
+@pytest.mark.parametrize(
+    ("kind", "size_px"),
+    [
+        ("anaglyph_grey", (160, 120)),
+        ("side_by_side", (320, 120)),
+        ("wiggle", (160, 120)),
+        ("view", (160, 120)),
+    ],
+)
+def test_a_3_d_picture_of_a_smaller_size_has_smaller_views(result, kind, size_px, tmp_path):
+    made = write_stereo_picture(Wish(kind=kind, longer_side_px=160), result, tmp_path / "a", lambda *_: None)
+    with Image.open(made.file) as picture:
+        assert picture.size == size_px
+
+
+def test_a_3_d_photo_of_a_smaller_size_is_smaller(result, tmp_path):
+    small, whole = (
+        write_stereo_picture(
+            Wish(kind="viewer", longer_side_px=side), result, tmp_path / f"{side}", lambda *_: None
+        ).file.stat()
+        for side in (160, AUTOMATIC_PX)
+    )
+    assert small.st_size < 0.7 * whole.st_size
+
+
+def test_borders_are_cut_off_only_on_request_and_where_views_lie_upon_each_other(result, tmp_path):
+    def width_of(kind: str, crops: bool) -> int:
+        wish = Wish(kind=kind, crops=crops, position=1.5).plain()
+        made = write_stereo_picture(wish, result, tmp_path / f"{kind}{crops}", lambda *_: None)
+        with Image.open(made.file) as picture:
+            return picture.width
+
+    assert width_of("view", False) == WIDTH > width_of("view", True) > WIDTH - 20
+    assert width_of("depth_map", True) == width_of("side_by_side", True) / 2 == WIDTH
+
+
+def test_animations_are_small_enough_to_send_unless_the_full_size_is_asked_for():
+    assert Wish(kind="wiggle").size_px == (800, 800)
+    assert Wish(kind="wiggle", longer_side_px=FULL_PX).size_px == (FULL_PX, FULL_PX)
+    assert Wish(kind="crossed").size_px == (FULL_PX, FULL_PX)
+
+
+def test_a_size_and_a_crop_are_chosen_in_the_page(answered, tmp_path):
+    answered.move("1.5")
+    answered.open("3-D picture")
+    make_picture(answered, "view", tmp_path)
+    answered.page.get_by_label("Cut off borders").check()
+    answered.page.wait_for_function(
+        "width => document.querySelector('#preview img')?.naturalWidth < width", arg=WIDTH
+    )
+    answered.page.get_by_label("Cut off borders").uncheck()
+    make_picture(answered, "side_by_side", tmp_path)
+    assert not answered.page.locator("#crop").is_visible()
 
 
 def test_five_seconds_of_a_film_are_shown_as_a_preview(visit, tmp_path):
