@@ -17,8 +17,8 @@ LIFETIME_S = 3600
 # at once take as long as one after the other (18 to 33 s and 24 to 34 s, three times), whether each has all
 # threads or half of them; with all threads, a pair alone takes half as long.
 MATCHING: dict[str, Any] = {"concurrency_id": "matching", "concurrency_limit": 2, "api_visibility": "private"}
-# One film at a time, beside the pictures, because a film takes minutes.
-FILMS: dict[str, Any] = {"concurrency_id": "films", "concurrency_limit": 1, "api_visibility": "private"}
+# One video at a time, beside the pictures, because a video takes minutes.
+VIDEOS: dict[str, Any] = {"concurrency_id": "videos", "concurrency_limit": 1, "api_visibility": "private"}
 _CANCELLED = "Cancelled. Anything below is from before. Change what you like, and start again."
 
 

@@ -16,11 +16,12 @@ from stereoweave.matching.backend import Backend
 from stereoweave.matching.options import MatchOptions
 from stereoweave.outputs.measure import distance
 from stereoweave.outputs.point_cloud import EmptyError, make_point_cloud, write_glb
-from stereoweave.outputs.report import Summary, downscale
+from stereoweave.outputs.report import Summary
 from stereoweave.outputs.results import FILES, needs_camera, write_files
 from stereoweave.outputs.run import Result, run
 from stereoweave.pictures.prepare import Request, prepare
 from stereoweave.rendering.renderer import Renderer
+from stereoweave.rendering.scaling import fit_size, scale_down
 from stereoweave.stereo import Estimate, StereoCamera, StereoPair
 
 _LONGER_SIDE_PX = 1280
@@ -105,7 +106,8 @@ def check_uploads(files: Iterable[Path | None]) -> None:
 
 def open_session(result: Result, folder: Path) -> Session:
     """Return a session for a result, which keeps its files in `folder`."""
-    pair, estimate = downscale(result.pair, result.estimate, _LONGER_SIDE_PX)
+    size_px = fit_size(result.pair.left.shape, (_LONGER_SIDE_PX, _LONGER_SIDE_PX))
+    pair, estimate = scale_down(result.pair, result.estimate, size_px)
     renderer = Renderer(*crop_both(pair, estimate))
     return Session(result=result, pair=pair, estimate=estimate, renderer=renderer, folder=folder)
 

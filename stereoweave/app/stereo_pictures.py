@@ -161,7 +161,8 @@ def write_stereo_picture(
     if image is None:
         return StereoPicture(file, file)
     shown = folder / "preview.jpg"
-    write_image(shown, _shrink(image))
+    size_px = fit_size(image.shape, (_PREVIEW_PX, _PREVIEW_PX))
+    write_image(shown, cv2.resize(image, size_px, interpolation=cv2.INTER_AREA))
     return StereoPicture(file, shown)
 
 
@@ -206,9 +207,3 @@ def crop_both(pair: StereoPair, estimate: Estimate) -> tuple[StereoPair, Estimat
         confidence=estimate.confidence[part],
         occluded=estimate.occluded[part],
     )
-
-
-def _shrink(picture: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
-    scale = min(1.0, _PREVIEW_PX / max(picture.shape))
-    size = tuple(max(1, round(scale * side)) for side in picture.shape[1::-1])
-    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA)

@@ -39,7 +39,7 @@ Out = Annotated[
         help="File to write (default: in the current folder, named after the left picture and the layout, "
         "such as left_view.png or left_wiggle.webp). Viewers recognise some layouts by a mark in the file "
         "name, which is added automatically: view.png becomes view_qs8x6a0.75.png for a quilt. .mpo and .jps "
-        "are 3-D pictures, .html is a 3-D page (--layout viewer).",
+        "are 3-D pictures, .html is a 3-D photo (--layout viewer).",
     ),
 ]
 Position = Annotated[
@@ -59,7 +59,8 @@ Layout = Annotated[
         help="Layout of several views in one picture: side_by_side, side_by_side_half, crossed, top_bottom, "
         "top_bottom_half, anaglyph_grey, anaglyph_colour, anaglyph_half_colour, anaglyph_dubois, rgbd, "
         "quilt or contact_sheet; an animation, sweep or wiggle, as .mp4 (extra 'video'), .gif or .webp; or "
-        "viewer, a page for any browser (.html) in which the mouse or a finger moves the viewpoint."
+        "viewer, a 3-D photo: a page for any browser (.html) in which the mouse or a finger moves the "
+        "viewpoint."
     ),
 ]
 Convergence = Annotated[
