@@ -47,6 +47,17 @@ def connect_cancel(cancel: gr.Button, status: gr.HTML, events: Sequence[Any]) ->
     )
 
 
+def scroll_to(status: gr.HTML, triggers: Sequence[Any]) -> None:
+    """Scroll to the status at these triggers where it is out of sight, as below the form on a telephone."""
+    look = f"""() => {{
+        const status = document.getElementById("{status.elem_id}");
+        if (status.getBoundingClientRect().top > 0.5 * innerHeight)
+            status.scrollIntoView({{ behavior: "smooth" }});
+    }}"""
+    for trigger in triggers:
+        trigger(None, None, None, js=look, api_visibility="private")
+
+
 def switch(cancel: gr.Button, triggers: Sequence[Any], *, on: bool) -> None:
     """Switch the button to cancel on or off at these triggers.
 

@@ -11,7 +11,7 @@ from uuid import uuid4
 
 import gradio as gr
 
-from stereoweave.app.events import LIFETIME_S, MATCHING, Host, connect_cancel, switch
+from stereoweave.app.events import LIFETIME_S, MATCHING, Host, connect_cancel, scroll_to, switch
 from stereoweave.app.notices import (
     Wording,
     format_legend,
@@ -23,6 +23,7 @@ from stereoweave.app.pair_form import LABELS, PairForm, label_of
 from stereoweave.app.session import (
     Session,
     colour_depth,
+    find_early_warnings,
     format_colour_range,
     format_summary,
     mark_clicks,
@@ -120,6 +121,7 @@ class PairTab:
     def _connect(self) -> None:
         """Connect events to their handlers."""
         form, taken = self._form, [self._status, *self._file_parts]
+        scroll_to(self._status, [form.find.click, form.sample.click])
         switch(form.cancel, [form.find.click, form.sample.click], on=True)
         sampled = form.sample.click(form.fill_in_sample, None, form.fields, api_visibility="private")
         long, ends = [], []
@@ -134,6 +136,7 @@ class PairTab:
             written = found.then(
                 self._write_files, self._session, taken, show_progress_on=self._status, **MATCHING
             )
+            scroll_to(self._status, [found.then])
             long += [found, written]
             ends.append(written.then)
         made = self._stereo.connect(self._picture_tab, form.cancel)
@@ -214,17 +217,17 @@ class PairTab:
             written = await self._host.work(request, work, progress)
         except (StereoweaveError, OSError) as error:
             return {self._status: self._wording.format_error(error)}
-        banner = format_warnings(self._wording.format_notes(written.warnings))
         archive = written.archive
         return {
-            self._status: banner + self._format_summary(session, written.notes),
+            self._status: self._format_summary(session, written.warnings, written.notes),
             self._files: [str(file) for file in written.files],
             self._all: gr.update(value=archive and str(archive), visible=archive is not None),
         }
 
-    def _format_summary(self, session: Session, notes: Sequence[Note] = ()) -> str:
+    def _format_summary(self, session: Session, warnings: Sequence[Note], notes: Sequence[Note] = ()) -> str:
+        banner = format_warnings(self._wording.format_notes(warnings))
         lines = self._wording.format_notes([*session.result.notes, *notes])
-        return format_notice([format_summary(session.result.summary), *lines])
+        return banner + format_notice([*format_summary(session.result.summary), *lines])
 
     def _open_result(self, result: Result, position: float) -> dict[Any, Any]:
         folder = Path(tempfile.mkdtemp(dir=self._host.folder))
@@ -234,7 +237,7 @@ class PairTab:
         pair, estimate = session.pair, session.estimate
         view, where = self._render_view(session, position)
         return {
-            self._status: self._format_summary(session),
+            self._status: self._format_summary(session, find_early_warnings(session.result)),
             self._results: gr.update(visible=True),
             self._session: session,
             self._view: view,
@@ -258,7 +261,7 @@ class PairTab:
         if session is None:
             return gr.skip(), _GONE
         view = session.renderer.view(position)
-        unseen = f"{100 * (~view.drawn).mean():.1f} % of it seen by neither camera"
+        unseen = f"{100 * (~view.drawn).mean():.1f} % of it filled in, as neither camera saw it"
         return view.image, f"{position:g}, {_describe_position(position)}; {unseen}"
 
     def _make_cloud(self, session: Session | None) -> str | None:

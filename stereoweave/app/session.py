@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from stereoweave.app.stereo_pictures import StereoPicture, Wish, crop_both
-from stereoweave.errors import NameOf, Note, StereoweaveError, keyword
+from stereoweave.errors import FormatError, NameOf, Note, Remedy, StereoweaveError, keyword
 from stereoweave.io.colormap import colour_disparity, find_colour_range_px
 from stereoweave.matching.backend import Backend
 from stereoweave.matching.options import MatchOptions
@@ -19,7 +19,7 @@ from stereoweave.outputs.point_cloud import EmptyError, make_point_cloud, write_
 from stereoweave.outputs.report import Summary
 from stereoweave.outputs.results import FILES, needs_camera, write_files
 from stereoweave.outputs.run import Result, run
-from stereoweave.pictures.prepare import Request, prepare
+from stereoweave.pictures.prepare import Prepared, Request, prepare
 from stereoweave.rendering.renderer import Renderer
 from stereoweave.rendering.scaling import fit_size, scale_down
 from stereoweave.stereo import Estimate, StereoCamera, StereoPair
@@ -32,6 +32,8 @@ _FARTHEST = 4.0
 # Files up to this total size, reached at about 8 megapixels, are stored twice: individually and in the zip.
 _MOST_ZIPPED_BYTES = 300 * 1024**2
 _FARTHEST_SHOWN_M = 1000
+# The files that everyone can open.
+_SHOWN_FIRST = ("report.html", "preview.png")
 _NO_METRES = "For metres, give a calibration file, or the focal length and the baseline."
 
 
@@ -84,14 +86,34 @@ def match_uploads(uploads: Uploads, report_progress: Callable[[float, str], None
     `report_progress` is called with the completed fraction, from 0 to 1, and the name of the next step.
     """
     if not uploads.pictures:
-        raise StereoweaveError("expected a left and a right picture, or one file with both views, found none")
+        raise StereoweaveError(
+            "expected a left and a right picture, or one file with both views, found none; drop them on the "
+            "form, or try the sample"
+        )
     check_uploads([*uploads.pictures, uploads.request.calibration])
     report_progress(0.1, "reading")
-    prepared = prepare(uploads.pictures, uploads.request)
+    prepared = _prepare(uploads)
     height, width = prepared.pair.left.shape[:2]
     report_progress(0.3, f"matching {width}×{height} px")
     result = run(prepared, uploads.backend.matcher(), MatchOptions(refined=True))
-    return replace(result, name_of=uploads.name_of)
+    result = replace(result, name_of=uploads.name_of)
+    find_early_warnings(result)
+    return result
+
+
+def find_early_warnings(result: Result) -> list[Note]:
+    """Return the warnings if they cost little, as after an alignment, so that they are shown at once."""
+    return result.warnings() if result.alignment else []
+
+
+def _prepare(uploads: Uploads) -> Prepared:
+    """Prepare the uploads; the error for a damaged calibration says that there may be none."""
+    try:
+        return prepare(uploads.pictures, uploads.request)
+    except FormatError as error:
+        if error.remedy is None and error.message.startswith(f"{uploads.request.calibration}: "):
+            error.remedy = Remedy("give another file, or none", ("calibration",))
+        raise
 
 
 def check_uploads(files: Iterable[Path | None]) -> None:
@@ -136,6 +158,7 @@ def write_all(result: Result, folder: Path, report_progress: Callable[[float, st
     report_progress(0.8, "writing the files")
     names = [name for name in FILES if result.pair.camera or not needs_camera(name)]
     notes = write_files(folder, names, result)
+    names.sort(key=lambda name: name not in _SHOWN_FIRST)
     files = [file for file in map(folder.joinpath, names) if file.exists()]
     archive = zip_files(folder / "stereoweave.zip", files)
     return Written(files=files, archive=archive, notes=notes, warnings=warnings)
@@ -208,20 +231,26 @@ def measure_clicks(session: Session, clicks: Sequence[tuple[int, int]]) -> list[
         return [*lines, _NO_METRES]
     if len(points) == 2:
         try:
-            lines.append(f"Between the two: {distance(estimate, camera, *points)}")
+            measured = distance(estimate, camera, *points)
+            lines.append(
+                f"Between the two: {measured}: 68 % of such distances are as near to the truth as that"
+            )
         except StereoweaveError as error:
             lines.append(f"Between the two: {error}")
     return lines
 
 
-def format_summary(summary: Summary) -> str:
-    """Format a result's size, time, disparity, depth and confidence as one line."""
-    text = f"{summary.width_px}×{summary.height_px} px, matched in {summary.estimate_ms / 1000:.1f} s: "
-    text += f"disparity {summary.disparity_p1_px:.1f} to {summary.disparity_p99_px:.1f} px"
+def format_summary(summary: Summary) -> list[str]:
+    """Format a result's depth and confidence as one line, its size, time and disparity as another."""
+    depth = "Depth without metres (they need a calibration)"
     if summary.depth_p1_m is not None:
-        middle = _format_metres(summary.depth_median_m)
-        text += f", depth from {summary.depth_p1_m:.2f} m, median {middle}"
-    return f"{text}; confident in {summary.confident_percent:.0f} % of the picture"
+        depth = f"Depth from {summary.depth_p1_m:.2f} m, median {_format_metres(summary.depth_median_m)}"
+    return [
+        f"{depth}; confident in {summary.confident_percent:.0f} % of the picture",
+        f"{summary.width_px}×{summary.height_px} px, matched in {summary.estimate_ms / 1000:.1f} s; "
+        f"between the pictures, things move by {summary.disparity_p1_px:.1f} to "
+        f"{summary.disparity_p99_px:.1f} px (disparity)",
+    ]
 
 
 def _format_metres(depth_m: float | None) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 
 import gradio as gr
 
-from stereoweave.app.events import LIFETIME_S, VIDEOS, Host, connect_cancel, switch
+from stereoweave.app.events import LIFETIME_S, VIDEOS, Host, connect_cancel, scroll_to, switch
 from stereoweave.app.notices import Wording, format_notice, format_warnings, name_setting
 from stereoweave.app.pair_form import MODELS, make_layout_choice, read_layout
 from stereoweave.app.video_upload import OUTPUTS, PREVIEW_S, ConvertedVideo, VideoUpload, convert_upload
@@ -21,7 +21,11 @@ _EMPTY = f"""<div class="empty"><ol>
 <li>Choose what to make, and press <b>Preview {PREVIEW_S} seconds</b> to see whether you like it.</li>
 <li>Press <b>Convert the whole video</b>. It takes many times its own length; keep this page open.</li>
 </ol></div>"""
-_LABELS = {"format": "Layout of a single video", "model": "Quality"}
+_LABELS = {
+    "format": "Layout of a single video",
+    "model": "Quality",
+    "start_s": "Begin the preview at second",
+}
 # A partial, because it is sent to the process that does the work.
 label_of = partial(name_setting, _LABELS)
 
@@ -57,12 +61,11 @@ class VideoTab:
         )
         self._start_s = gr.Number(
             0,
-            minimum=0,
-            label="Begin the preview at second",
+            label=_LABELS["start_s"],
             info="0: the start",
             elem_id="video-start",
         )
-        with gr.Accordion("More about the video", open=False):
+        with gr.Accordion("Layout and quality", open=False):
             self._layout = make_layout_choice(_LABELS["format"], PAIR_LAYOUTS, "video-layout")
             self._model = gr.Radio(MODELS[:2], value="small", label=_LABELS["model"], elem_id="video-model")
         self._preview = gr.Button(f"Preview {PREVIEW_S} seconds", variant="primary", elem_id="video-preview")
@@ -82,6 +85,7 @@ class VideoTab:
         }
         shown = [self._status, self._shown, self._file, self._made]
         begins = [self._preview.click, self._whole.click]
+        scroll_to(self._status, begins)
         switch(self._cancel, begins, on=True)
         events = [
             begin(handler, asked, shown, show_progress_on=self._status, **VIDEOS)

@@ -13,6 +13,7 @@ from rich.console import Console
 from stereoweave.app.session import check_uploads
 from stereoweave.errors import FormatError, NameOf, StereoweaveError
 from stereoweave.io.animation import require_video_extra
+from stereoweave.io.decoding import open_picture
 from stereoweave.matching.backend import Backend
 from stereoweave.rendering.layouts import LayoutOptions, add_mark
 from stereoweave.stereo import StereoPair
@@ -97,11 +98,7 @@ def convert_upload(upload: VideoUpload, folder: Path, report: Callable[[float, s
     Raises:
         StereoweaveError: See `open_video` and `convert_video`; or there is no video, or it has expired.
     """
-    if not upload.files:
-        raise StereoweaveError("expected a video with both views, or a left and a right video, found none")
-    check_uploads(upload.files)
-    for file in upload.files:
-        _check_container(file)
+    _check_upload(upload)
     with require_video_extra("a video"):
         from stereoweave.video.convert import convert_video
         from stereoweave.video.job import VideoJob
@@ -123,6 +120,26 @@ def convert_upload(upload: VideoUpload, folder: Path, report: Callable[[float, s
     return ConvertedVideo(out, summary, [*console.lines, *_describe_problems(tally)])
 
 
+def _check_upload(upload: VideoUpload) -> None:
+    """Raise a StereoweaveError if there is no video, it has expired, or a setting does not fit it."""
+    if not upload.files:
+        raise StereoweaveError(
+            "expected a video with both views, or a left and a right video, found none; drop it on the form"
+        )
+    check_uploads(upload.files)
+    if upload.format and len(upload.files) > 1:
+        raise StereoweaveError(
+            "expected one video that holds both views, found two videos; choose detected, or give one video",
+            setting="format",
+        )
+    if upload.start_s is not None and upload.start_s < 0:
+        raise StereoweaveError(
+            f"expected a time from 0 s, the start, found {upload.start_s:g} s", setting="start_s"
+        )
+    for file in upload.files:
+        _check_container(file)
+
+
 def _check_container(file: Path) -> None:
     """Raise FormatError unless a video holds its own content.
 
@@ -133,10 +150,22 @@ def _check_container(file: Path) -> None:
     try:
         av.open(str(file), options={"format_whitelist": ",".join(_CONTAINERS)}).close()
     except av.error.FFmpegError as error:
+        found = (
+            "a picture; give it under “Pictures”"
+            if _is_picture(file)
+            else "another kind of file, or a damaged one; copy it again, or save it as MP4"
+        )
         raise FormatError(
-            f"{file.name}: expected a video (MP4, MOV, MKV, WebM, AVI, MPEG, WMV, FLV or OGG), found another "
-            "kind of file, or a damaged one"
+            f"{file.name}: expected a video (MP4, MOV, MKV, WebM, AVI, MPEG, WMV, FLV or OGG), found {found}"
         ) from error
+
+
+def _is_picture(file: Path) -> bool:
+    try:
+        with open_picture(file):
+            return True
+    except FormatError:
+        return False
 
 
 class _FrameReport:

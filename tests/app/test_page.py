@@ -75,7 +75,7 @@ def answered(browser, address) -> Iterator[Visit]:
     """Yield a visitor who has uploaded the example pair and has its result."""
     with visiting(browser, address) as visit:
         visit.give(left=TEXTURED / "left.png", right=TEXTURED / "right.png")
-        visit.page.get_by_text("More about the pictures").click()
+        visit.page.get_by_text("Layout and calibration").click()
         visit.give(calibration=TEXTURED / "calib.txt")
         assert "640×480 px" in visit.find()
         yield visit
@@ -167,14 +167,14 @@ def test_the_sample_needs_one_click_and_has_metres(visit):
 
 def test_an_invalid_focal_length_is_reported(hasty):
     hasty.give(left=TEXTURED / "left.png", right=TEXTURED / "right.png")
-    hasty.page.get_by_text("More about the pictures").click()
+    hasty.page.get_by_text("Layout and calibration").click()
     for name in ("focal", "baseline"):
         field = hasty.page.locator(f"#{name} input")
         field.click()
         field.press("ControlOrMeta+a")
         field.press_sequentially("-600")
         field.press("Tab")
-    assert "expected a number above 1e-09, found -600" in hasty.find()
+    assert "“Focal length, px”: expected a number from 0 to 1,000,000" in hasty.find()
     for name in ("focal", "baseline"):
         hasty.page.locator(f"#{name} input").fill("0")
 
@@ -250,7 +250,7 @@ def test_an_invalid_picture_is_named_without_its_folder(hasty, tmp_path):
 
 
 def test_a_form_without_pictures_is_reported(hasty):
-    assert hasty.find() == "expected a left and a right picture, or one file with both views, found none"
+    assert hasty.find().startswith("expected a left and a right picture, or one file with both views")
 
 
 def test_a_picture_of_800_megapixels_is_refused(hasty, tmp_path):
