@@ -48,8 +48,13 @@ _ABOUT_FILES = """<p><b>report.html</b> shows the result in any browser; <b>prev
 colour. <b>depth</b> is in metres, <b>disparity</b> in pixels; <b>cloud</b> and <b>mesh</b> open in 3-D
 programs. PNG files are for image editors; PFM, NPY and TIFF files are for programming. There are metres, and
 thus depth, cloud and mesh, only with a calibration, or with focal length and baseline.</p>"""
+_ABOUT_NOTES = "What was done with the pictures, and in brackets the field that changes it:"
 _GUESSED_POINTS = "The proportions are a guess: without a calibration, the cameras are unknown."
 _TO_MEASURE = "Click two points in the left picture to see their depths and the distance between them here."
+_TO_COMPARE = (
+    "Click two points in the left picture to compare their disparities: what is nearer has a larger one. "
+    "Distances in metres need a calibration file, or the focal length and the baseline."
+)
 _WITHOUT_WEBGL = """const canvas = document.createElement("canvas");
 if (!canvas.getContext("webgl2") && !canvas.getContext("webgl")) element.innerHTML =
   '<p class="notice problem">This browser cannot draw in 3-D: turn on its hardware acceleration ' +
@@ -227,6 +232,8 @@ class PairTab:
     def _format_summary(self, session: Session, warnings: Sequence[Note], notes: Sequence[Note] = ()) -> str:
         banner = format_warnings(self._wording.format_notes(warnings))
         lines = self._wording.format_notes([*session.result.notes, *notes])
+        if lines:
+            lines.insert(0, _ABOUT_NOTES)
         return banner + format_notice([*format_summary(session.result.summary), *lines])
 
     def _open_result(self, result: Result, position: float) -> dict[Any, Any]:
@@ -248,7 +255,7 @@ class PairTab:
             self._clickable: pair.left,
             self._clicks: [],
             self._tabs: gr.update(selected="first"),
-            self._measured: format_paragraphs([_TO_MEASURE]),
+            self._measured: format_paragraphs([_TO_MEASURE if pair.camera else _TO_COMPARE]),
             self._cloud: None,
             self._about_points: "" if session.result.pair.camera else format_paragraphs([_GUESSED_POINTS]),
             self._files: None,
@@ -297,7 +304,7 @@ def _make_picture(label: str, name: str) -> gr.Image:
 
 
 def _format_depth_legend(session: Session) -> str:
-    far, near = format_colour_range(session.result)
+    far, near = format_colour_range(session)
     return format_legend(
         f"linear-gradient(90deg,{','.join(legend_colours(24))})", f"far: {far}", f"near: {near}"
     )

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from stereoweave.app.stereo_pictures import StereoPicture, Wish, crop_both
+from stereoweave.cameras.rectify import find_content
 from stereoweave.errors import FormatError, NameOf, Note, Remedy, StereoweaveError, keyword
 from stereoweave.io.colormap import colour_disparity, find_colour_range_px
 from stereoweave.matching.backend import Backend
@@ -43,8 +44,9 @@ class Session:
 
     Attributes:
         result: The result at full size.
-        pair, estimate: Both at the size at which the page shows them.
-        renderer: Renderer of views at that size, without the borders of an aligned pair.
+        pair, estimate: Both as the page shows them, scaled down and without the borders of an aligned pair.
+        content: The rows and columns of the full-size left image that they show.
+        renderer: Renderer of views of that pair.
         folder: Folder of the result's files.
         stereo_pictures: The 3-D pictures made so far.
     """
@@ -52,6 +54,7 @@ class Session:
     result: Result
     pair: StereoPair
     estimate: Estimate
+    content: tuple[slice, slice]
     renderer: Renderer
     folder: Path
     stereo_pictures: dict[Wish, StereoPicture] = field(default_factory=dict)
@@ -63,11 +66,16 @@ class Session:
 
     def given_px(self, shown_px: tuple[int, int]) -> tuple[int, int]:
         """Convert the column and row of a pixel in the displayed image to those in the full-size image."""
-        given, shown = self.result.pair.left.shape[1::-1], self.pair.left.shape[1::-1]
         column, row = (
-            round((at + 0.5) * n / m - 0.5) for at, n, m in zip(shown_px, given, shown, strict=True)
+            round(part.start + (at + 0.5) * (part.stop - part.start) / side - 0.5)
+            for at, part, side in zip(shown_px, self.content[::-1], self.pair.left.shape[1::-1], strict=True)
         )
         return column, row
+
+    @property
+    def scale(self) -> float:
+        """The size at which the page shows the pair, as a share of its own."""
+        return self.pair.left.shape[1] / (self.content[1].stop - self.content[1].start)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,10 +136,17 @@ def check_uploads(files: Iterable[Path | None]) -> None:
 
 def open_session(result: Result, folder: Path) -> Session:
     """Return a session for a result, which keeps its files in `folder`."""
-    size_px = fit_size(result.pair.left.shape, (_LONGER_SIDE_PX, _LONGER_SIDE_PX))
-    pair, estimate = scale_down(result.pair, result.estimate, size_px)
-    renderer = Renderer(*crop_both(pair, estimate))
-    return Session(result=result, pair=pair, estimate=estimate, renderer=renderer, folder=folder)
+    pair, estimate = crop_both(result.pair, result.estimate)
+    size_px = fit_size(pair.left.shape, (_LONGER_SIDE_PX, _LONGER_SIDE_PX))
+    pair, estimate = scale_down(pair, estimate, size_px)
+    return Session(
+        result=result,
+        pair=pair,
+        estimate=estimate,
+        content=find_content(result.pair),
+        renderer=Renderer(pair, estimate),
+        folder=folder,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -193,20 +208,18 @@ def write_cloud(file: Path, result: Result) -> Path | None:
 
 
 def colour_depth(session: Session) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the disparity as an RGB image [H, W, 3], black outside the left image's content."""
-    disparity_px, seen = session.estimate.disparity_px, session.pair.left_seen
-    if seen is None:
-        return colour_disparity(disparity_px, find_colour_range_px(disparity_px))
-    return colour_disparity(disparity_px, find_colour_range_px(disparity_px[seen][None])) * seen[..., None]
+    """Return the disparity as an RGB image [H, W, 3]."""
+    disparity_px = session.estimate.disparity_px
+    return colour_disparity(disparity_px, find_colour_range_px(disparity_px))
 
 
-def format_colour_range(result: Result) -> tuple[str, str]:
+def format_colour_range(session: Session) -> tuple[str, str]:
     """Format the depths of the first and the last colour, or the disparities if the camera is unknown."""
-    seen = np.s_[:] if result.pair.left_seen is None else result.pair.left_seen
-    ends_px = np.array([find_colour_range_px(np.atleast_2d(result.estimate.disparity_px[seen]))])
-    if not result.pair.camera:
-        return f"{ends_px[0, 0]:.1f} px", f"{ends_px[0, 1]:.1f} px"
-    far_m, near_m = result.pair.camera.depth_m(ends_px)[0]
+    ends_px = np.array([find_colour_range_px(session.estimate.disparity_px)])
+    if not session.pair.camera:
+        far_px, near_px = ends_px[0] / session.scale
+        return f"{far_px:.1f} px", f"{near_px:.1f} px"
+    far_m, near_m = session.pair.camera.depth_m(ends_px)[0]
     return _format_metres(far_m), _format_metres(near_m)
 
 

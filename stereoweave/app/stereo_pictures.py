@@ -8,14 +8,14 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from stereoweave.cameras.rectify import crop
+from stereoweave.cameras.rectify import crop, find_content
 from stereoweave.io.images import write_image
 from stereoweave.outputs.run import Result
 from stereoweave.outputs.view_files import ViewFile, can_crop
 from stereoweave.rendering.layouts import ANIMATIONS, LAYOUTS, VIEWER, LayoutOptions, is_converged
 from stereoweave.rendering.renderer import Renderer
 from stereoweave.rendering.scaling import fit_size, scale_down
-from stereoweave.stereo import Estimate, StereoCamera, StereoPair
+from stereoweave.stereo import Estimate, StereoPair
 
 # Larger GIF files are too large for most messengers.
 _ANIMATED_PX = 800
@@ -190,18 +190,13 @@ def _write_depth_map(
 
 
 def crop_both(pair: StereoPair, estimate: Estimate) -> tuple[StereoPair, Estimate]:
-    """Crop a pair and its estimate to the largest rectangle that both pictures cover; drop the camera.
+    """Crop a pair and its estimate to the largest rectangle that both pictures cover.
 
     Raises:
         StereoweaveError: No pixel is valid in both pictures.
     """
-    # A camera whose centre is the first pixel tells where the rectangle begins.
-    cropped = crop(replace(pair, camera=StereoCamera(focal_px=1, baseline_m=1, cx_px=0, cy_px=0)))
-    assert cropped.camera is not None
-    top, left = round(-cropped.camera.cy_px), round(-cropped.camera.cx_px)
-    height, width = cropped.left.shape[:2]
-    part = np.s_[top : top + height, left : left + width]
-    return replace(cropped, camera=None), Estimate(
+    part = find_content(pair)
+    return crop(pair), Estimate(
         disparity_px=estimate.disparity_px[part],
         right_disparity_px=estimate.right_disparity_px[part],
         confidence=estimate.confidence[part],

@@ -19,6 +19,7 @@ from PIL import Image
 from playwright.sync_api import Browser
 
 from stereoweave.app.session import Uploads, match_uploads, open_session, write_cloud, zip_files
+from stereoweave.cameras.rectify import find_content
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.colormap import colour_disparity, find_colour_range_px
 from stereoweave.io.images import read_image, write_image
@@ -223,11 +224,19 @@ def test_views_of_an_aligned_pair_have_no_borders(tmp_path):
     result = match_uploads(uploads, lambda share, what: None)
     session = open_session(result, tmp_path)
     assert result.pair.left_seen is not None
-    assert session.pair.left.shape == result.pair.left.shape == (420, 560, 3)
+    assert result.pair.left.shape == (420, 560, 3)
     height, width = session.renderer.view(0.5).image.shape[:2]
     assert 400 < height < 420
     assert 480 < width <= 560
-    assert session.renderer.pair.left_seen is None
+    assert session.pair.left.shape[:2] == (height, width) == session.estimate.disparity_px.shape
+    assert session.pair.left_seen is None
+    # A click on the first and the last shown pixel is one on the corners of the content.
+    rows, columns = find_content(result.pair)
+    assert session.given_px((0, 0)) == (columns.start, rows.start)
+    assert session.given_px((width - 1, height - 1)) == (columns.stop - 1, rows.stop - 1)
+    shown = session.pair.left[height // 2, width // 2]
+    column, row = session.given_px((width // 2, height // 2))
+    assert (shown == result.pair.left[row, column]).all()
 
 
 def test_large_files_are_not_zipped(tmp_path):
