@@ -19,7 +19,7 @@ LIFETIME_S = 3600
 MATCHING: dict[str, Any] = {"concurrency_id": "matching", "concurrency_limit": 2, "api_visibility": "private"}
 # One video at a time, beside the pictures, because a video takes minutes.
 VIDEOS: dict[str, Any] = {"concurrency_id": "videos", "concurrency_limit": 1, "api_visibility": "private"}
-_CANCELLED = "Cancelled. Anything below is from before. Change what you like, and start again."
+_CANCELLED = "Cancelled. Change what you like, and start again. A result below is from before."
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Host:
 def connect_cancel(cancel: gr.Button, status: gr.HTML, events: Sequence[Any]) -> None:
     """Let a button cancel these events; it can be pressed while one of them is running or waiting."""
     cancel.click(
-        lambda: (format_notice([_CANCELLED]), gr.update(interactive=False)),
+        lambda: (f'<div class="cancelled">{format_notice([_CANCELLED])}</div>', gr.update(interactive=False)),
         None,
         [status, cancel],
         cancels=list(events),

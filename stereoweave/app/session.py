@@ -173,7 +173,7 @@ def write_all(result: Result, folder: Path, report_progress: Callable[[float, st
     report_progress(0.8, "writing the files")
     names = [name for name in FILES if result.pair.camera or not needs_camera(name)]
     notes = write_files(folder, names, result)
-    names.sort(key=lambda name: name not in _SHOWN_FIRST)
+    names = [*_SHOWN_FIRST, *(name for name in names if name not in _SHOWN_FIRST)]
     files = [file for file in map(folder.joinpath, names) if file.exists()]
     archive = zip_files(folder / "stereoweave.zip", files)
     return Written(files=files, archive=archive, notes=notes, warnings=warnings)

@@ -181,6 +181,17 @@ def test_a_waiting_job_can_be_cancelled(server, browser, endless_video):
         first.page.locator("#video-status").get_by_text(AT_WORK).wait_for()
 
 
+def test_a_job_cancelled_at_once_shows_no_error(visit, endless_video):
+    visit.open("Video")
+    visit.give(video_left=endless_video)
+    for _ in range(3):
+        visit.page.click("#video-whole")
+        visit.page.click("#video-cancel")
+        visit.page.locator("#video-status").get_by_text("Cancelled").wait_for()
+        visit.page.wait_for_timeout(1000)
+        assert not visit.page.locator("#video-status .error").is_visible()
+
+
 # By kind: the picture's format, and its width and height.
 STILLS = {
     "side_by_side": ("JPEG", (2 * WIDTH, HEIGHT)),
