@@ -48,7 +48,8 @@ _ABOUT_FILES = """<p><b>report.html</b> shows the result in any browser; <b>prev
 colour. <b>depth</b> is in metres, <b>disparity</b> in pixels; <b>cloud</b> and <b>mesh</b> open in 3-D
 programs. PNG files are for image editors; PFM, NPY and TIFF files are for programming. There are metres, and
 thus depth, cloud and mesh, only with a calibration, or with focal length and baseline.</p>"""
-_ABOUT_NOTES = "What was done with the pictures, and in brackets the field that changes it:"
+_ABOUT_NOTES = "What was done with the pictures:"
+_ABOUT_REMEDIES = "What was done with the pictures, and in brackets the field that changes it:"
 _GUESSED_POINTS = "The proportions are a guess: without a calibration, the cameras are unknown."
 _TO_MEASURE = "Click two points in the left picture to see their depths and the distance between them here."
 _TO_COMPARE = (
@@ -233,7 +234,7 @@ class PairTab:
         banner = format_warnings(self._wording.format_notes(warnings))
         lines = self._wording.format_notes([*session.result.notes, *notes])
         if lines:
-            lines.insert(0, _ABOUT_NOTES)
+            lines.insert(0, _ABOUT_REMEDIES if any("(“" in line for line in lines) else _ABOUT_NOTES)
         return banner + format_notice([*format_summary(session.result.summary), *lines])
 
     def _open_result(self, result: Result, position: float) -> dict[Any, Any]:

@@ -246,7 +246,7 @@ def measure_clicks(session: Session, clicks: Sequence[tuple[int, int]]) -> list[
         try:
             measured = distance(estimate, camera, *points)
             lines.append(
-                f"Between the two: {measured}: 68 % of such distances are as near to the truth as that"
+                f"Between the two: {measured}; in two of three cases, the error is smaller than that"
             )
         except StereoweaveError as error:
             lines.append(f"Between the two: {error}")

@@ -151,8 +151,9 @@ def _describe(kind: str) -> tuple[str, Any]:
 
 def _format_frame(page: str, shape: tuple[int, ...]) -> str:
     """Format a page as a frame, whose scripts reach nothing outside it."""
-    look = f"aspect-ratio: {shape[1]} / {shape[0]}"
+    # The sensors, for the phone's tilt and a headset.
+    allowed = "accelerometer *; gyroscope *; xr-spatial-tracking *"
     return (
-        f'<iframe title="3-D photo" style="{look}" sandbox="allow-scripts" srcdoc="{html.escape(page)}">'
-        "</iframe>"
+        f'<iframe title="3-D photo" style="aspect-ratio: {shape[1]} / {shape[0]}" sandbox="allow-scripts" '
+        f'allow="{allowed}" srcdoc="{html.escape(page)}"></iframe>'
     )
