@@ -140,7 +140,7 @@ class PairTab:
                 **MATCHING,
             )
             written = found.then(
-                self._write_files, self._session, taken, show_progress_on=self._status, **MATCHING
+                self._write_files, self._session, taken, show_progress_on=self._files, **MATCHING
             )
             scroll_to(self._status, [found.then])
             long += [found, written]
