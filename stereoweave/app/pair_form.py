@@ -88,12 +88,13 @@ class PairForm:
     def read(self, given: dict[Any, Any], provider: str) -> Uploads:
         """Return the uploads and settings that a visitor has given."""
         calibration = given[self.calibration]
+        focal_px = _read_positive("focal_px", given[self.focal_px])
         baseline_mm = _read_positive("baseline_m", given[self.baseline_mm])
         where_needed = True if calibration else None
         request = Request(
             format=read_layout(given[self.layout]),
             calibration=Path(calibration) if calibration else None,
-            focal_px=_read_positive("focal_px", given[self.focal_px]),
+            focal_px=focal_px,
             baseline_m=baseline_mm and baseline_mm / 1000,
             rectify=where_needed if given[self.rectify] else False,
         )
