@@ -21,6 +21,7 @@ PACKAGE = Path(sw.__file__).parent
 TESTS = Path(__file__).parent
 # Settings that no constant names, by module and expression.
 VARIABLE: dict[tuple[str, str], set[str]] = {
+    ("app/pair_form.py", "setting"): {"focal_px", "baseline_m"},
     ("errors.py", "error.setting"): set(),  # of an error that another one takes the place of
     ("pictures/pair_finding.py", "side"): {"left", "right"},
     ("rendering/renderer.py", "name"): {"up", "forward"},
@@ -34,8 +35,8 @@ SHARED = {"cameras", "matching", "outputs", "pictures", "rendering"}
 # Settings of these subpackages that the page and the service do not offer.
 ABSENT = {
     "page": {
-        *("align", "board", "convergence_px", "crop", "files", "forward", "layout", "left"),
-        *("listed", "out", "position", "provider", "quilt", "range_px", "raw", "refined"),
+        *("align", "board", "convergence_px", "files", "forward", "layout", "left"),
+        *("listed", "out", "provider", "quilt", "range_px", "raw", "refined"),
         *("right", "strength", "up"),
     },
     "service": {
@@ -83,7 +84,7 @@ SHARED_SETTINGS = {setting for module, setting in SETTINGS if module.split("/")[
 def test_a_command_has_an_option_for_each_setting():
     options = [option_names(command) for command in list_commands(typer.main.get_command(app))]
     unknown = {name for _, name in SETTINGS if not any(option_of(name) for option_of in options)}
-    assert unknown == {"split", "align"}  # settings of recipes only, and of Python only
+    assert unknown == {"split", "align", "start_s"}  # settings of recipes, of Python and of the page only
 
 
 def test_the_service_has_a_field_for_each_setting_that_it_offers():

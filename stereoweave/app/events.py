@@ -17,9 +17,9 @@ LIFETIME_S = 3600
 # at once take as long as one after the other (18 to 33 s and 24 to 34 s, three times), whether each has all
 # threads or half of them; with all threads, a pair alone takes half as long.
 MATCHING: dict[str, Any] = {"concurrency_id": "matching", "concurrency_limit": 2, "api_visibility": "private"}
-# One film at a time, beside the pictures, because a film takes minutes.
-FILMS: dict[str, Any] = {"concurrency_id": "films", "concurrency_limit": 1, "api_visibility": "private"}
-_CANCELLED = "Cancelled. Anything below is from before. Change what you like, and start again."
+# One video at a time, beside the pictures, because a video takes minutes.
+VIDEOS: dict[str, Any] = {"concurrency_id": "videos", "concurrency_limit": 1, "api_visibility": "private"}
+_CANCELLED = "Cancelled. Change what you like, and start again. A result below is from before."
 
 
 @dataclass(frozen=True)
@@ -38,13 +38,24 @@ class Host:
 def connect_cancel(cancel: gr.Button, status: gr.HTML, events: Sequence[Any]) -> None:
     """Let a button cancel these events; it can be pressed while one of them is running or waiting."""
     cancel.click(
-        lambda: (format_notice([_CANCELLED]), gr.update(interactive=False)),
+        lambda: (f'<div class="cancelled">{format_notice([_CANCELLED])}</div>', gr.update(interactive=False)),
         None,
         [status, cancel],
         cancels=list(events),
         concurrency_limit=None,
         api_visibility="private",
     )
+
+
+def scroll_to(status: gr.HTML, triggers: Sequence[Any]) -> None:
+    """Scroll to the status at these triggers where it is out of sight, as below the form on a telephone."""
+    look = f"""() => {{
+        const status = document.getElementById("{status.elem_id}");
+        if (status.getBoundingClientRect().top > 0.5 * innerHeight)
+            status.scrollIntoView({{ behavior: "smooth" }});
+    }}"""
+    for trigger in triggers:
+        trigger(None, None, None, js=look, api_visibility="private")
 
 
 def switch(cancel: gr.Button, triggers: Sequence[Any], *, on: bool) -> None:

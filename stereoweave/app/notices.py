@@ -6,6 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from stereoweave.errors import NameOf, Note, format_error
+from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS
+
+# The name of a layout, but not within a file's name. The form's fields show it with spaces.
+_LAYOUT = re.compile(rf"(?<![\w.-])({'|'.join(PAIR_LAYOUTS)})(?![\w.-])")
 
 
 class Wording:
@@ -28,7 +32,8 @@ class Wording:
         return [self._format_line(note.format(self._name_of)) for note in notes]
 
     def _format_line(self, line: str) -> str:
-        return re.sub(rf"{re.escape(str(self._folder))}/\w+/", "", " ".join(line.splitlines()))
+        line = re.sub(rf"{re.escape(str(self._folder))}/(\w+/)+", "", " ".join(line.splitlines()))
+        return _LAYOUT.sub(lambda found: found[0].replace("_", " "), line)
 
 
 def name_setting(labels: dict[str, str], setting: str) -> str | None:

@@ -1,10 +1,10 @@
-"""The Gradio web page: depth, views and 3-D pictures of an uploaded pair, and 3-D films."""
+"""The Gradio web page: depth, views and 3-D pictures of an uploaded pair, and videos."""
 
 import gradio as gr
 
 from stereoweave.app.events import LIFETIME_S, Host
-from stereoweave.app.film_tab import FilmTab
 from stereoweave.app.pair_tab import PairTab
+from stereoweave.app.video_tab import VideoTab
 
 # Each session keeps its last result. It takes 60 MB plus 19 bytes per pixel of the left picture in memory
 # (0.5 GB at 24 megapixels), and the size of its files on disk (0.9 GB at 24 megapixels).
@@ -24,8 +24,8 @@ def make_page(host: Host) -> gr.Blocks:
         with gr.Tabs():
             with gr.Tab("Pictures"):
                 PairTab(host)
-            with gr.Tab("Film"):
-                FilmTab(host)
+            with gr.Tab("Video"):
+                VideoTab(host)
 
         def stop_work(request: gr.Request) -> None:
             host.workers.stop(str(request.session_hash))

@@ -9,16 +9,19 @@ import gradio as gr
 
 from stereoweave.app.notices import name_setting
 from stereoweave.app.session import Uploads
+from stereoweave.errors import StereoweaveError
 from stereoweave.matching.backend import Backend
 from stereoweave.pictures.loading import FORMATS
 from stereoweave.pictures.prepare import Request
 from stereoweave.pictures.sample import sample_folder
 
 _DETECTED = "detected"
+# No lens has a focal length of more pixels, and no rig a baseline of more millimetres.
+_MOST = 1_000_000
 MODELS = [("fast", "small"), ("fine", "base"), ("finest", "best")]
 
-# Labels of the form's fields, by setting.
-_LABELS = {
+# Labels of the fields for a pair, by setting.
+LABELS = {
     "format": "Layout of a single file",
     "baseline_m": "Baseline, mm",
     "calibration": "Calibration file, for metres",
@@ -26,8 +29,11 @@ _LABELS = {
     "model": "Quality",
     "rectify": "Align the pictures",
     "no_rectify": "Align the pictures",
+    "crop": "Cut off borders",
+    "position": "Viewpoint",
+    "video": "Video",
 }
-label_of = partial(name_setting, _LABELS)
+label_of = partial(name_setting, LABELS)
 
 
 class PairForm:
@@ -38,23 +44,23 @@ class PairForm:
         self.right = gr.File(label="Right picture", height=160, elem_id="right")
         self.rectify = gr.Checkbox(
             value=True,
-            label=_LABELS["rectify"],
-            info="Only where needed, as in pictures taken by hand; not with focal length and baseline.",
+            label=LABELS["rectify"],
+            info="Where needed, as when taken by hand. Untick it to keep the pictures as they are.",
             elem_id="rectify",
         )
         self.model = gr.Radio(
             MODELS,
             value="best",
-            label=_LABELS["model"],
-            info="Finer takes longer: fine 2 times, finest 5 times.",
+            label=LABELS["model"],
+            info="Fine takes 2 times as long as fast, finest 5 times.",
             elem_id="model",
         )
-        with gr.Accordion("More about the pictures", open=False):
-            self.layout = make_layout_choice(_LABELS["format"], FORMATS, "layout")
-            self.calibration = gr.File(label=_LABELS["calibration"], height=140, elem_id="calibration")
+        with gr.Accordion("Layout and calibration", open=False):
+            self.layout = make_layout_choice(LABELS["format"], FORMATS, "layout")
+            self.calibration = gr.File(label=LABELS["calibration"], height=140, elem_id="calibration")
             with gr.Row():
-                self.focal_px = _make_optional_number(_LABELS["focal_px"], "focal")
-                self.baseline_mm = _make_optional_number(_LABELS["baseline_m"], "baseline")
+                self.focal_px = _make_optional_number(LABELS["focal_px"], "focal")
+                self.baseline_mm = _make_optional_number(LABELS["baseline_m"], "baseline")
         self.find = gr.Button("Find depth", variant="primary", elem_id="find")
         self.cancel = gr.Button("Cancel", variant="stop", interactive=False, elem_id="cancel")
         self.sample = gr.Button("Try the sample", elem_id="sample")
@@ -81,12 +87,14 @@ class PairForm:
 
     def read(self, given: dict[Any, Any], provider: str) -> Uploads:
         """Return the uploads and settings that a visitor has given."""
-        calibration, baseline_mm = given[self.calibration], given[self.baseline_mm] or None
+        calibration = given[self.calibration]
+        focal_px = _read_positive("focal_px", given[self.focal_px])
+        baseline_mm = _read_positive("baseline_m", given[self.baseline_mm])
         where_needed = True if calibration else None
         request = Request(
             format=read_layout(given[self.layout]),
             calibration=Path(calibration) if calibration else None,
-            focal_px=given[self.focal_px] or None,
+            focal_px=focal_px,
             baseline_m=baseline_mm and baseline_mm / 1000,
             rectify=where_needed if given[self.rectify] else False,
         )
@@ -104,6 +112,17 @@ def make_layout_choice(label: str, names: Iterable[str], elem_id: str) -> gr.Dro
 def read_layout(given: str) -> str | None:
     """Return the layout that a visitor has chosen; None to detect it."""
     return None if given == _DETECTED else given
+
+
+def _read_positive(setting: str, given: float | None) -> float | None:
+    """Return a number that a visitor has typed; None if it is unknown."""
+    if not given:
+        return None
+    if not 0 < given <= _MOST:
+        raise StereoweaveError(
+            f"expected a number from 0 to {_MOST:,}, where 0 is unknown, found {given:g}", setting=setting
+        )
+    return given
 
 
 def _make_optional_number(label: str, name: str) -> gr.Number:

@@ -11,7 +11,7 @@ from uuid import uuid4
 
 import gradio as gr
 
-from stereoweave.app.events import LIFETIME_S, MATCHING, Host, connect_cancel, switch
+from stereoweave.app.events import LIFETIME_S, MATCHING, Host, connect_cancel, scroll_to, switch
 from stereoweave.app.notices import (
     Wording,
     format_legend,
@@ -19,10 +19,11 @@ from stereoweave.app.notices import (
     format_paragraphs,
     format_warnings,
 )
-from stereoweave.app.pair_form import PairForm, label_of
+from stereoweave.app.pair_form import LABELS, PairForm, label_of
 from stereoweave.app.session import (
     Session,
     colour_depth,
+    find_early_warnings,
     format_colour_range,
     format_summary,
     mark_clicks,
@@ -47,8 +48,14 @@ _ABOUT_FILES = """<p><b>report.html</b> shows the result in any browser; <b>prev
 colour. <b>depth</b> is in metres, <b>disparity</b> in pixels; <b>cloud</b> and <b>mesh</b> open in 3-D
 programs. PNG files are for image editors; PFM, NPY and TIFF files are for programming. There are metres, and
 thus depth, cloud and mesh, only with a calibration, or with focal length and baseline.</p>"""
+_ABOUT_NOTES = "What was done with the pictures:"
+_ABOUT_REMEDIES = "What was done with the pictures, and in brackets the field that changes it:"
 _GUESSED_POINTS = "The proportions are a guess: without a calibration, the cameras are unknown."
 _TO_MEASURE = "Click two points in the left picture to see their depths and the distance between them here."
+_TO_COMPARE = (
+    "Click two points in the left picture to compare their disparities: what is nearer has a larger one. "
+    "Distances in metres need a calibration file, or the focal length and the baseline."
+)
 _WITHOUT_WEBGL = """const canvas = document.createElement("canvas");
 if (!canvas.getContext("webgl2") && !canvas.getContext("webgl")) element.innerHTML =
   '<p class="notice problem">This browser cannot draw in 3-D: turn on its hardware acceleration ' +
@@ -78,7 +85,7 @@ class PairTab:
             with gr.Tab("View", id="first"):
                 self._build_views()
             with gr.Tab("3-D picture") as self._picture_tab:
-                self._stereo = StereoPictureTab(self._host, self._wording)
+                self._stereo = StereoPictureTab(self._host, self._wording, self._session, self._position)
             with gr.Tab("3-D points") as self._cloud_tab:
                 gr.HTML(js_on_load=_WITHOUT_WEBGL, padding=False)
                 self._about_points = gr.HTML(elem_id="about-points")
@@ -103,7 +110,7 @@ class PairTab:
             1.5,
             value=0.5,
             step=0.05,
-            label="Viewpoint",
+            label=LABELS["position"],
             info="0 is the left camera, 1 the right one",
             buttons=[],
             elem_id="position",
@@ -120,6 +127,7 @@ class PairTab:
     def _connect(self) -> None:
         """Connect events to their handlers."""
         form, taken = self._form, [self._status, *self._file_parts]
+        scroll_to(self._status, [form.find.click, form.sample.click])
         switch(form.cancel, [form.find.click, form.sample.click], on=True)
         sampled = form.sample.click(form.fill_in_sample, None, form.fields, api_visibility="private")
         long, ends = [], []
@@ -132,11 +140,12 @@ class PairTab:
                 **MATCHING,
             )
             written = found.then(
-                self._write_files, self._session, taken, show_progress_on=self._status, **MATCHING
+                self._write_files, self._session, taken, show_progress_on=self._files, **MATCHING
             )
+            scroll_to(self._status, [found.then])
             long += [found, written]
             ends.append(written.then)
-        made = self._stereo.connect(self._picture_tab, self._session, form.cancel)
+        made = self._stereo.connect(self._picture_tab, form.cancel)
         connect_cancel(form.cancel, self._status, [*long, *made])
         switch(form.cancel, [*ends, *(event.then for event in made)], on=False)
         self._connect_views()
@@ -214,17 +223,19 @@ class PairTab:
             written = await self._host.work(request, work, progress)
         except (StereoweaveError, OSError) as error:
             return {self._status: self._wording.format_error(error)}
-        banner = format_warnings(self._wording.format_notes(written.warnings))
         archive = written.archive
         return {
-            self._status: banner + self._format_summary(session, written.notes),
+            self._status: self._format_summary(session, written.warnings, written.notes),
             self._files: [str(file) for file in written.files],
             self._all: gr.update(value=archive and str(archive), visible=archive is not None),
         }
 
-    def _format_summary(self, session: Session, notes: Sequence[Note] = ()) -> str:
+    def _format_summary(self, session: Session, warnings: Sequence[Note], notes: Sequence[Note] = ()) -> str:
+        banner = format_warnings(self._wording.format_notes(warnings))
         lines = self._wording.format_notes([*session.result.notes, *notes])
-        return format_notice([format_summary(session.result.summary), *lines])
+        if lines:
+            lines.insert(0, _ABOUT_REMEDIES if any("(“" in line for line in lines) else _ABOUT_NOTES)
+        return banner + format_notice([*format_summary(session.result.summary), *lines])
 
     def _open_result(self, result: Result, position: float) -> dict[Any, Any]:
         folder = Path(tempfile.mkdtemp(dir=self._host.folder))
@@ -234,7 +245,7 @@ class PairTab:
         pair, estimate = session.pair, session.estimate
         view, where = self._render_view(session, position)
         return {
-            self._status: self._format_summary(session),
+            self._status: self._format_summary(session, find_early_warnings(session.result)),
             self._results: gr.update(visible=True),
             self._session: session,
             self._view: view,
@@ -245,7 +256,7 @@ class PairTab:
             self._clickable: pair.left,
             self._clicks: [],
             self._tabs: gr.update(selected="first"),
-            self._measured: format_paragraphs([_TO_MEASURE]),
+            self._measured: format_paragraphs([_TO_MEASURE if pair.camera else _TO_COMPARE]),
             self._cloud: None,
             self._about_points: "" if session.result.pair.camera else format_paragraphs([_GUESSED_POINTS]),
             self._files: None,
@@ -258,7 +269,7 @@ class PairTab:
         if session is None:
             return gr.skip(), _GONE
         view = session.renderer.view(position)
-        unseen = f"{100 * (~view.drawn).mean():.1f} % of it seen by neither camera"
+        unseen = f"{100 * (~view.drawn).mean():.1f} % of it filled in, as neither camera saw it"
         return view.image, f"{position:g}, {_describe_position(position)}; {unseen}"
 
     def _make_cloud(self, session: Session | None) -> str | None:
@@ -294,7 +305,7 @@ def _make_picture(label: str, name: str) -> gr.Image:
 
 
 def _format_depth_legend(session: Session) -> str:
-    far, near = format_colour_range(session.result)
+    far, near = format_colour_range(session)
     return format_legend(
         f"linear-gradient(90deg,{','.join(legend_colours(24))})", f"far: {far}", f"near: {near}"
     )

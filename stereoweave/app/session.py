@@ -9,18 +9,20 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from stereoweave.app.stereo_pictures import StereoPicture, crop_both
-from stereoweave.errors import NameOf, Note, StereoweaveError, keyword
+from stereoweave.app.stereo_pictures import StereoPicture, Wish, crop_both
+from stereoweave.cameras.rectify import find_content
+from stereoweave.errors import FormatError, NameOf, Note, Remedy, StereoweaveError, keyword
 from stereoweave.io.colormap import colour_disparity, find_colour_range_px
 from stereoweave.matching.backend import Backend
 from stereoweave.matching.options import MatchOptions
 from stereoweave.outputs.measure import distance
 from stereoweave.outputs.point_cloud import EmptyError, make_point_cloud, write_glb
-from stereoweave.outputs.report import Summary, downscale
+from stereoweave.outputs.report import Summary
 from stereoweave.outputs.results import FILES, needs_camera, write_files
 from stereoweave.outputs.run import Result, run
-from stereoweave.pictures.prepare import Request, prepare
+from stereoweave.pictures.prepare import Prepared, Request, prepare
 from stereoweave.rendering.renderer import Renderer
+from stereoweave.rendering.scaling import fit_size, scale_down
 from stereoweave.stereo import Estimate, StereoCamera, StereoPair
 
 _LONGER_SIDE_PX = 1280
@@ -31,6 +33,8 @@ _FARTHEST = 4.0
 # Files up to this total size, reached at about 8 megapixels, are stored twice: individually and in the zip.
 _MOST_ZIPPED_BYTES = 300 * 1024**2
 _FARTHEST_SHOWN_M = 1000
+# The files that everyone can open.
+_SHOWN_FIRST = ("report.html", "preview.png")
 _NO_METRES = "For metres, give a calibration file, or the focal length and the baseline."
 
 
@@ -40,18 +44,20 @@ class Session:
 
     Attributes:
         result: The result at full size.
-        pair, estimate: Both at the size at which the page shows them.
-        renderer: Renderer of views at that size, without the borders of an aligned pair.
+        pair, estimate: Both as the page shows them, scaled down and without the borders of an aligned pair.
+        content: The rows and columns of the full-size left image that they show.
+        renderer: Renderer of views of that pair.
         folder: Folder of the result's files.
-        stereo_pictures: The 3-D pictures made so far, by kind.
+        stereo_pictures: The 3-D pictures made so far.
     """
 
     result: Result
     pair: StereoPair
     estimate: Estimate
+    content: tuple[slice, slice]
     renderer: Renderer
     folder: Path
-    stereo_pictures: dict[str, StereoPicture] = field(default_factory=dict)
+    stereo_pictures: dict[Wish, StereoPicture] = field(default_factory=dict)
 
     @property
     def is_written(self) -> bool:
@@ -60,11 +66,16 @@ class Session:
 
     def given_px(self, shown_px: tuple[int, int]) -> tuple[int, int]:
         """Convert the column and row of a pixel in the displayed image to those in the full-size image."""
-        given, shown = self.result.pair.left.shape[1::-1], self.pair.left.shape[1::-1]
         column, row = (
-            round((at + 0.5) * n / m - 0.5) for at, n, m in zip(shown_px, given, shown, strict=True)
+            round(part.start + (at + 0.5) * (part.stop - part.start) / side - 0.5)
+            for at, part, side in zip(shown_px, self.content[::-1], self.pair.left.shape[1::-1], strict=True)
         )
         return column, row
+
+    @property
+    def scale(self) -> float:
+        """The size at which the page shows the pair, as a share of its own."""
+        return self.pair.left.shape[1] / (self.content[1].stop - self.content[1].start)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,14 +94,34 @@ def match_uploads(uploads: Uploads, report_progress: Callable[[float, str], None
     `report_progress` is called with the completed fraction, from 0 to 1, and the name of the next step.
     """
     if not uploads.pictures:
-        raise StereoweaveError("expected a left and a right picture, or one file with both views, found none")
+        raise StereoweaveError(
+            "expected a left and a right picture, or one file with both views, found none; drop them on the "
+            "form, or try the sample"
+        )
     check_uploads([*uploads.pictures, uploads.request.calibration])
     report_progress(0.1, "reading")
-    prepared = prepare(uploads.pictures, uploads.request)
+    prepared = _prepare(uploads)
     height, width = prepared.pair.left.shape[:2]
     report_progress(0.3, f"matching {width}×{height} px")
     result = run(prepared, uploads.backend.matcher(), MatchOptions(refined=True))
-    return replace(result, name_of=uploads.name_of)
+    result = replace(result, name_of=uploads.name_of)
+    find_early_warnings(result)
+    return result
+
+
+def find_early_warnings(result: Result) -> list[Note]:
+    """Return the warnings if they cost little, as after an alignment, so that they are shown at once."""
+    return result.warnings() if result.alignment else []
+
+
+def _prepare(uploads: Uploads) -> Prepared:
+    """Prepare the uploads; the error for a damaged calibration says that there may be none."""
+    try:
+        return prepare(uploads.pictures, uploads.request)
+    except FormatError as error:
+        if error.remedy is None and error.message.startswith(f"{uploads.request.calibration}: "):
+            error.remedy = Remedy("give another file, or none", ("calibration",))
+        raise
 
 
 def check_uploads(files: Iterable[Path | None]) -> None:
@@ -105,9 +136,17 @@ def check_uploads(files: Iterable[Path | None]) -> None:
 
 def open_session(result: Result, folder: Path) -> Session:
     """Return a session for a result, which keeps its files in `folder`."""
-    pair, estimate = downscale(result.pair, result.estimate, _LONGER_SIDE_PX)
-    renderer = Renderer(*crop_both(pair, estimate))
-    return Session(result=result, pair=pair, estimate=estimate, renderer=renderer, folder=folder)
+    pair, estimate = crop_both(result.pair, result.estimate)
+    size_px = fit_size(pair.left.shape, (_LONGER_SIDE_PX, _LONGER_SIDE_PX))
+    pair, estimate = scale_down(pair, estimate, size_px)
+    return Session(
+        result=result,
+        pair=pair,
+        estimate=estimate,
+        content=find_content(result.pair),
+        renderer=Renderer(pair, estimate),
+        folder=folder,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,6 +173,7 @@ def write_all(result: Result, folder: Path, report_progress: Callable[[float, st
     report_progress(0.8, "writing the files")
     names = [name for name in FILES if result.pair.camera or not needs_camera(name)]
     notes = write_files(folder, names, result)
+    names = [*_SHOWN_FIRST, *(name for name in names if name not in _SHOWN_FIRST)]
     files = [file for file in map(folder.joinpath, names) if file.exists()]
     archive = zip_files(folder / "stereoweave.zip", files)
     return Written(files=files, archive=archive, notes=notes, warnings=warnings)
@@ -168,20 +208,18 @@ def write_cloud(file: Path, result: Result) -> Path | None:
 
 
 def colour_depth(session: Session) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the disparity as an RGB image [H, W, 3], black outside the left image's content."""
-    disparity_px, seen = session.estimate.disparity_px, session.pair.left_seen
-    if seen is None:
-        return colour_disparity(disparity_px, find_colour_range_px(disparity_px))
-    return colour_disparity(disparity_px, find_colour_range_px(disparity_px[seen][None])) * seen[..., None]
+    """Return the disparity as an RGB image [H, W, 3]."""
+    disparity_px = session.estimate.disparity_px
+    return colour_disparity(disparity_px, find_colour_range_px(disparity_px))
 
 
-def format_colour_range(result: Result) -> tuple[str, str]:
+def format_colour_range(session: Session) -> tuple[str, str]:
     """Format the depths of the first and the last colour, or the disparities if the camera is unknown."""
-    seen = np.s_[:] if result.pair.left_seen is None else result.pair.left_seen
-    ends_px = np.array([find_colour_range_px(np.atleast_2d(result.estimate.disparity_px[seen]))])
-    if not result.pair.camera:
-        return f"{ends_px[0, 0]:.1f} px", f"{ends_px[0, 1]:.1f} px"
-    far_m, near_m = result.pair.camera.depth_m(ends_px)[0]
+    ends_px = np.array([find_colour_range_px(session.estimate.disparity_px)])
+    if not session.pair.camera:
+        far_px, near_px = ends_px[0] / session.scale
+        return f"{far_px:.1f} px", f"{near_px:.1f} px"
+    far_m, near_m = session.pair.camera.depth_m(ends_px)[0]
     return _format_metres(far_m), _format_metres(near_m)
 
 
@@ -206,20 +244,26 @@ def measure_clicks(session: Session, clicks: Sequence[tuple[int, int]]) -> list[
         return [*lines, _NO_METRES]
     if len(points) == 2:
         try:
-            lines.append(f"Between the two: {distance(estimate, camera, *points)}")
+            measured = distance(estimate, camera, *points)
+            lines.append(
+                f"Between the two: {measured}; in two of three cases, the error is smaller than that"
+            )
         except StereoweaveError as error:
             lines.append(f"Between the two: {error}")
     return lines
 
 
-def format_summary(summary: Summary) -> str:
-    """Format a result's size, time, disparity, depth and confidence as one line."""
-    text = f"{summary.width_px}×{summary.height_px} px, matched in {summary.estimate_ms / 1000:.1f} s: "
-    text += f"disparity {summary.disparity_p1_px:.1f} to {summary.disparity_p99_px:.1f} px"
+def format_summary(summary: Summary) -> list[str]:
+    """Format a result's depth and confidence as one line, its size, time and disparity as another."""
+    depth = "Depth without metres (they need a calibration)"
     if summary.depth_p1_m is not None:
-        middle = _format_metres(summary.depth_median_m)
-        text += f", depth from {summary.depth_p1_m:.2f} m, median {middle}"
-    return f"{text}; confident in {summary.confident_percent:.0f} % of the picture"
+        depth = f"Depth from {summary.depth_p1_m:.2f} m, median {_format_metres(summary.depth_median_m)}"
+    return [
+        f"{depth}; confident in {summary.confident_percent:.0f} % of the picture",
+        f"{summary.width_px}×{summary.height_px} px, matched in {summary.estimate_ms / 1000:.1f} s; "
+        f"between the pictures, things move by {summary.disparity_p1_px:.1f} to "
+        f"{summary.disparity_p99_px:.1f} px (disparity)",
+    ]
 
 
 def _format_metres(depth_m: float | None) -> str:

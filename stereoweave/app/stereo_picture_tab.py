@@ -1,59 +1,101 @@
-"""The page's tab that offers a result as 3-D pictures: layouts, animations and the depth map."""
+"""The page's tab that offers a result as 3-D pictures, with a preview of each."""
 
+import html
 from functools import partial
+from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import gradio as gr
 
 from stereoweave.app.events import MATCHING, Host, switch
 from stereoweave.app.notices import Wording, format_paragraphs
-from stereoweave.app.session import Session
-from stereoweave.app.stereo_pictures import KINDS, write_stereo_picture
+from stereoweave.app.pair_form import LABELS
+from stereoweave.app.stereo_pictures import AUTOMATIC_PX, FULL_PX, KINDS, Wish, write_stereo_picture
 from stereoweave.errors import StereoweaveError
 
 _FIRST = "anaglyph_dubois"
+_SIZES = [
+    ("automatic", AUTOMATIC_PX),
+    ("full", FULL_PX),
+    *((f"{side} px", side) for side in (2560, 1600, 1080, 640)),
+]
 
 
 class StereoPictureTab:
-    """A choice of 3-D pictures, with how to look at each, a preview, and its file."""
+    """A choice of 3-D pictures, with how to look at each, a preview, and its file.
 
-    def __init__(self, host: Host, wording: Wording) -> None:
+    Args:
+        host: What the page's parts share.
+        wording: The form's words.
+        session: The visitor's result.
+        position: The viewpoint of the kind that shows one view.
+    """
+
+    def __init__(self, host: Host, wording: Wording, session: gr.State, position: gr.Slider) -> None:
         self._host, self._wording = host, wording
-        self._kind = gr.Dropdown(
-            [(kind.label, name) for name, kind in KINDS.items()],
-            value=_FIRST,
-            label="Kind of 3-D picture",
-            elem_id="kind",
-        )
+        self._session, self._position = session, position
+        with gr.Row(equal_height=True):
+            self._kind = gr.Dropdown(
+                [(kind.label, name) for name, kind in KINDS.items()],
+                value=_FIRST,
+                label="Kind of 3-D picture",
+                elem_id="kind",
+                scale=2,
+                min_width=240,
+            )
+            self._size = gr.Dropdown(
+                _SIZES, value=AUTOMATIC_PX, label="Longer side", elem_id="size", min_width=140
+            )
+            self._crops = gr.Checkbox(
+                label=LABELS["crop"],
+                info="Otherwise, they are filled in.",
+                elem_id="crop",
+                min_width=180,
+            )
         self._viewing = gr.HTML(format_paragraphs([KINDS[_FIRST].viewing]), elem_id="viewing")
         self._preview = gr.Image(
             label="Preview", interactive=False, buttons=["fullscreen"], elem_id="preview", alt_text="Preview"
         )
+        self._page = gr.HTML(visible=False, elem_id="photo", padding=False)
         self._file = gr.DownloadButton("Download", variant="primary", visible=False, elem_id="picture")
 
     @property
     def parts(self) -> list[Any]:
         """The parts that belong to one result."""
-        return [self._viewing, self._preview, self._file]
+        return [self._viewing, self._preview, self._page, self._file]
 
     def empty(self) -> dict[Any, Any]:
         """Return the parts' values for a new result."""
-        return {self._preview: None, self._file: gr.update(value=None, visible=False)}
+        return {
+            self._preview: gr.update(value=None, visible=True),
+            self._page: gr.update(value="", visible=False),
+            self._file: gr.update(value=None, visible=False),
+        }
 
-    def connect(self, tab: gr.Tab, session: gr.State, cancel: gr.Button) -> list[Any]:
-        """Make the chosen picture of a session when the tab is opened or the choice changes.
+    def connect(self, tab: gr.Tab, cancel: gr.Button) -> list[Any]:
+        """Make the chosen picture of the session when the tab is opened or a choice changes.
 
         Returns:
             The events that make it.
         """
-        begins = [tab.select, self._kind.input]
+        begins = [tab.select, self._kind.input, self._size.input, self._crops.input]
         switch(cancel, begins, on=True)
+        asked: set[Any] = {self._session, self._kind, self._size, self._crops, self._position}
+        self._kind.input(
+            _describe,
+            self._kind,
+            [self._viewing, self._crops],
+            show_progress="hidden",
+            concurrency_limit=None,
+            api_visibility="private",
+        )
         return [
             begin(
                 self._make,
-                [session, self._kind],
+                asked,
                 self.parts,
-                show_progress_on=self._preview,
+                show_progress_on=[self._preview, self._page],
                 trigger_mode="always_last",
                 **MATCHING,
             )
@@ -62,27 +104,56 @@ class StereoPictureTab:
 
     async def _make(
         self,
-        session: Session | None,
-        kind: str,
+        given: dict[Any, Any],
         request: gr.Request,
         progress: Any = gr.Progress(),  # noqa: B008
     ) -> dict[Any, Any]:
         """Write the picture unless it is there, and return how to look at it, its preview and its file."""
+        kind, session = given[self._kind], given[self._session]
         viewing = format_paragraphs([KINDS[kind].viewing])
         if session is None:
             return {self._viewing: viewing}
-        if kind not in session.stereo_pictures:
-            pair, estimate = session.result.pair, session.result.estimate
-            work = partial(write_stereo_picture, pair, estimate, kind, session.folder)
+        wish = Wish(
+            kind=kind,
+            longer_side_px=given[self._size],
+            crops=given[self._crops],
+            position=given[self._position],
+        ).plain()
+        if wish not in session.stereo_pictures:
+            work = partial(write_stereo_picture, wish, session.result, session.folder / uuid4().hex)
             try:
-                session.stereo_pictures[kind] = await self._host.work(request, work, progress)
+                session.stereo_pictures[wish] = await self._host.work(request, work, progress)
             except (StereoweaveError, OSError) as error:
                 return {self._viewing: self._wording.format_error(error), **self.empty()}
-        made = session.stereo_pictures[kind]
+        made = session.stereo_pictures[wish]
         size_mb = made.file.stat().st_size / 1e6
         label = f"Download {made.file.name} ({size_mb:.1f} MB)"
         return {
             self._viewing: viewing,
-            self._preview: str(made.shown),
+            **self._show(made.shown, session.pair.left.shape),
             self._file: gr.update(value=str(made.file), label=label, visible=True),
         }
+
+    def _show(self, shown: Path, shape: tuple[int, ...]) -> dict[Any, Any]:
+        """Return the values of the parts that show a picture, or a page in a frame of the picture's shape."""
+        is_page = shown.suffix == ".html"
+        frame = _format_frame(shown.read_text(encoding="utf-8"), shape) if is_page else ""
+        return {
+            self._preview: gr.update(value=None if is_page else str(shown), visible=not is_page),
+            self._page: gr.update(value=frame, visible=is_page),
+        }
+
+
+def _describe(kind: str) -> tuple[str, Any]:
+    """Return how to look at a kind, and whether its borders can be cut off."""
+    return format_paragraphs([KINDS[kind].viewing]), gr.update(visible=Wish(kind=kind).can_crop)
+
+
+def _format_frame(page: str, shape: tuple[int, ...]) -> str:
+    """Format a page as a frame, whose scripts reach nothing outside it."""
+    # The sensors, for the phone's tilt and a headset.
+    allowed = "accelerometer *; gyroscope *; xr-spatial-tracking *"
+    return (
+        f'<iframe title="3-D photo" style="aspect-ratio: {shape[1]} / {shape[0]}" sandbox="allow-scripts" '
+        f'allow="{allowed}" srcdoc="{html.escape(page)}"></iframe>'
+    )

@@ -1,4 +1,4 @@
-"""3-D pictures of a matched pair to download: layouts, animations and the depth map."""
+"""3-D pictures of a matched pair to download: layouts, animations, the 3-D photo and the depth map."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -8,26 +8,22 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from stereoweave.cameras.rectify import crop
-from stereoweave.io.animation import write_animation
+from stereoweave.cameras.rectify import crop, find_content
 from stereoweave.io.images import write_image
-from stereoweave.outputs.report import downscale
-from stereoweave.rendering.layouts import (
-    ANIMATIONS,
-    LAYOUTS,
-    LayoutOptions,
-    add_mark,
-    median_disparity_px,
-    render_views,
-    write_picture,
-)
+from stereoweave.outputs.run import Result
+from stereoweave.outputs.view_files import ViewFile, can_crop
+from stereoweave.rendering.layouts import ANIMATIONS, LAYOUTS, VIEWER, LayoutOptions, is_converged
 from stereoweave.rendering.renderer import Renderer
-from stereoweave.stereo import Estimate, StereoCamera, StereoPair
+from stereoweave.rendering.scaling import fit_size, scale_down
+from stereoweave.stereo import Estimate, StereoPair
 
-# GIF files of larger animations are too large for most messengers.
+# Larger GIF files are too large for most messengers.
 _ANIMATED_PX = 800
 _PREVIEW_PX = 1280
-_DEPTH_MAP = "depth_map"
+_DEPTH_MAP, _VIEW = "depth_map", "view"
+AUTOMATIC_PX = 0
+FULL_PX = 32_766
+"""The longest side that a picture can have."""
 
 
 @dataclass(frozen=True)
@@ -39,8 +35,13 @@ class Kind:
     ending: str
 
 
-# By the layout's or the animation's name, or a name of our own; MPO and JPS hold layouts of their own.
+# By the layout's name, or a name of our own.
 KINDS: dict[str, Kind] = {
+    VIEWER: Kind(
+        "3-D photo (to send)",
+        "Moves with the mouse, a finger or by itself. Send the file: any browser opens it, offline too.",
+        ".html",
+    ),
     "anaglyph_dubois": Kind(
         "Anaglyph (red-cyan glasses)",
         "Look through red-cyan glasses, red on the left eye. The best colours.",
@@ -56,11 +57,20 @@ KINDS: dict[str, Kind] = {
         "For VR headsets, 3-D viewers and parallel viewing: the left eye's view is on the left.",
         ".jpg",
     ),
+    _VIEW: Kind(
+        "View from the slider's place",
+        "An ordinary picture, from the viewpoint that the slider under “View” shows.",
+        ".jpg",
+    ),
     "crossed": Kind(
         "Crossed (without glasses)", "Cross your eyes until the two pictures become one.", ".jpg"
     ),
     "mpo": Kind("MPO (3-D camera)", "The file of 3-D cameras with both views, for 3-D televisions.", ".mpo"),
-    _DEPTH_MAP: Kind("Depth map", "White is near, black is far. For image editors and 3-D photos.", ".png"),
+    _DEPTH_MAP: Kind(
+        "Depth map",
+        "White is near, black is far. For image editors, and for sites that make pictures move.",
+        ".png",
+    ),
     "rgbd": Kind(
         "Picture beside its depth map", "For programs and displays that read colour with depth.", ".jpg"
     ),
@@ -87,8 +97,42 @@ KINDS: dict[str, Kind] = {
     "jps": Kind("JPS (3-D viewer)", "A JPEG file with both views, for 3-D picture viewers.", ".jps"),
     "contact_sheet": Kind("Contact sheet", "Nine small views from left to right, to compare them.", ".jpg"),
 }
-# The layouts that these two file formats hold.
-_HELD = {"mpo": "side_by_side", "jps": "crossed"}
+# The layouts of the kinds that are named otherwise; None is a single view.
+_LAYOUTS = {"mpo": "side_by_side", "jps": "crossed", _VIEW: None}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wish:
+    """A 3-D picture that a visitor wants.
+
+    Attributes:
+        kind: One of `KINDS`.
+        longer_side_px: Longest side of each view; `AUTOMATIC_PX` suits the kind.
+        crops: Whether to cut off borders, where the kind allows it.
+        position: Viewpoint of a single view.
+    """
+
+    kind: str
+    longer_side_px: int = AUTOMATIC_PX
+    crops: bool = False
+    position: float = 0.5
+
+    @property
+    def can_crop(self) -> bool:
+        """Whether the kind has borders to cut off."""
+        return self.kind != _DEPTH_MAP and can_crop(_LAYOUTS.get(self.kind, self.kind))
+
+    def plain(self) -> "Wish":
+        """Return the same wish without what its kind does not use: equal wishes make equal pictures."""
+        position = self.position if self.kind == _VIEW else 0.5
+        return replace(self, crops=self.crops and self.can_crop, position=position)
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Largest width and height of each view."""
+        automatic_px = _ANIMATED_PX if self.kind in ANIMATIONS else FULL_PX
+        side_px = self.longer_side_px or automatic_px
+        return side_px, side_px
 
 
 @dataclass(frozen=True)
@@ -100,58 +144,61 @@ class StereoPicture:
 
 
 def write_stereo_picture(
-    pair: StereoPair, estimate: Estimate, kind: str, folder: Path, report: Callable[[float, str], None]
+    wish: Wish, result: Result, folder: Path, report: Callable[[float, str], None]
 ) -> StereoPicture:
-    """Write one of the `KINDS` and a preview of it to a folder, without the borders of an aligned pair."""
+    """Write a 3-D picture and a preview of it to a folder, without the borders of an aligned pair."""
     report(0.1, "preparing")
-    pair, estimate = crop_both(pair, estimate)
-    file = folder / f"{'picture' if kind in _HELD else kind}{KINDS[kind].ending}"
+    folder.mkdir(exist_ok=True)
+    pair, estimate = crop_both(result.pair, result.estimate)
+    pictures = [Path(name) for name in result.summary.pictures]
+    file = folder / f"{pictures[0].stem}_{wish.kind}{KINDS[wish.kind].ending}"
     report(0.3, "drawing")
-    if kind in ANIMATIONS:
-        motion = ANIMATIONS[kind]
-        renderer = _make_renderer(*downscale(pair, estimate, _ANIMATED_PX), converged=motion.converged)
-        write_animation(file, render_views(renderer, motion.positions), motion.frame_ms)
-        return StereoPicture(file, file)
-    if kind == _DEPTH_MAP:
-        both = LAYOUTS["rgbd"].compose(_make_renderer(pair, estimate), LayoutOptions())
-        picture = both[:, pair.left.shape[1] :]
+    if wish.kind == _DEPTH_MAP:
+        image: UInt8[np.ndarray, "h w 3"] | None = _write_depth_map(file, pair, estimate, wish.size_px)
     else:
-        layout = _HELD.get(kind, kind)
-        file = add_mark(file, layout, pair, LayoutOptions())
-        renderer = _make_renderer(pair, estimate, converged=LAYOUTS[layout].converged)
-        picture = LAYOUTS[layout].compose(renderer, LayoutOptions())
-    report(0.8, "writing")
-    write_picture(file, picture)
-    shown = folder / f"{kind}_preview.jpg"
-    write_image(shown, _shrink(picture))
+        view_file = _make_view_file(wish, file).add_mark(pair)
+        file, image = view_file.path, view_file.write(pair, estimate, pictures).image
+    if image is None:
+        return StereoPicture(file, file)
+    shown = folder / "preview.jpg"
+    size_px = fit_size(image.shape, (_PREVIEW_PX, _PREVIEW_PX))
+    write_image(shown, cv2.resize(image, size_px, interpolation=cv2.INTER_AREA))
     return StereoPicture(file, shown)
 
 
-def _make_renderer(pair: StereoPair, estimate: Estimate, *, converged: bool = False) -> Renderer:
-    return Renderer(pair, estimate, convergence_px=median_disparity_px(estimate) if converged else 0.0)
+def _make_view_file(wish: Wish, file: Path) -> ViewFile:
+    name = _LAYOUTS.get(wish.kind, wish.kind)
+    return ViewFile(
+        path=file,
+        name=name,
+        position=wish.position,
+        convergence_px=None if is_converged(name) else 0.0,
+        size_px=wish.size_px,
+        crops=wish.crops,
+    )
+
+
+def _write_depth_map(
+    file: Path, pair: StereoPair, estimate: Estimate, size_px: tuple[int, int]
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Write and return the disparity in grey, where white is near."""
+    pair, estimate = scale_down(pair, estimate, fit_size(pair.left.shape, size_px))
+    both = LAYOUTS["rgbd"].compose(Renderer(pair, estimate), LayoutOptions())
+    image = np.ascontiguousarray(both[:, pair.left.shape[1] :])
+    write_image(file, image)
+    return image
 
 
 def crop_both(pair: StereoPair, estimate: Estimate) -> tuple[StereoPair, Estimate]:
-    """Crop a pair and its estimate to the largest rectangle that both pictures cover; drop the camera.
+    """Crop a pair and its estimate to the largest rectangle that both pictures cover.
 
     Raises:
         StereoweaveError: No pixel is valid in both pictures.
     """
-    # A camera whose centre is the first pixel tells where the rectangle begins.
-    cropped = crop(replace(pair, camera=StereoCamera(focal_px=1, baseline_m=1, cx_px=0, cy_px=0)))
-    assert cropped.camera is not None
-    top, left = round(-cropped.camera.cy_px), round(-cropped.camera.cx_px)
-    height, width = cropped.left.shape[:2]
-    part = np.s_[top : top + height, left : left + width]
-    return replace(cropped, camera=None), Estimate(
+    part = find_content(pair)
+    return crop(pair), Estimate(
         disparity_px=estimate.disparity_px[part],
         right_disparity_px=estimate.right_disparity_px[part],
         confidence=estimate.confidence[part],
         occluded=estimate.occluded[part],
     )
-
-
-def _shrink(picture: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
-    scale = min(1.0, _PREVIEW_PX / max(picture.shape))
-    size = tuple(max(1, round(scale * side)) for side in picture.shape[1::-1])
-    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA)

@@ -58,6 +58,18 @@ def rectify(pair: StereoPair, rig: Rig) -> Rectified:
     return Rectified(pair=rectified, notes=(*rig.notes, _summarize(rig, turns, rectified)))
 
 
+def find_content(pair: StereoPair) -> tuple[slice, slice]:
+    """Return the rows and columns of the largest rectangle that is valid in both pictures.
+
+    Raises:
+        StereoweaveError: No pixel is valid in both pictures.
+    """
+    full = np.ones(pair.left.shape[:2], bool)
+    for seen in (pair.left_seen, pair.right_seen):
+        full &= True if seen is None else seen
+    return _find_largest_rectangle(full)
+
+
 def crop(pair: StereoPair) -> StereoPair:
     """Crop a pair to the largest rectangle that is valid in both pictures, and adjust its camera.
 
@@ -66,10 +78,7 @@ def crop(pair: StereoPair) -> StereoPair:
     """
     if pair.left_seen is None and pair.right_seen is None:
         return pair
-    full = np.ones(pair.left.shape[:2], bool)
-    for seen in (pair.left_seen, pair.right_seen):
-        full &= True if seen is None else seen
-    rows, columns = _find_largest_rectangle(full)
+    rows, columns = find_content(pair)
     camera = pair.camera
     if camera is not None:
         centre = camera.cx_px - columns.start, camera.cy_px - rows.start

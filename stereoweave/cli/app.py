@@ -15,8 +15,8 @@ def app(
 ) -> None:
     """Serve a web page that shows depth and views of uploaded pairs.
 
-    The page also makes 3-D pictures, shows point clouds, measures distances, converts 3-D films and offers
-    all results for download.
+    The page also makes 3-D pictures, shows point clouds, measures distances, converts stereo videos and
+    offers all results for download.
     """
     from stereoweave.matching.providers import check_provider
 

@@ -26,6 +26,10 @@ _PARAMETERS = {
 }
 
 
+# Commands, where a remedy names another command.
+_COMMANDS = {"video": "stereoweave video"}
+
+
 @dataclass(frozen=True)
 class OptionNames:
     """The `NameOf` for one command; it can be sent to other processes.
@@ -46,7 +50,7 @@ def option_names(command: TyperCommand) -> OptionNames:
     options = [parameter for parameter in command.params if parameter.param_type_name == "option"]
     names = {str(option.name): option.opts[0] for option in options}
     negations = {f"no_{option.name}": option.secondary_opts[0] for option in options if option.secondary_opts}
-    return OptionNames(names | negations)
+    return OptionNames(_COMMANDS | names | negations)
 
 
 _WORDS = "stereoweave.words"

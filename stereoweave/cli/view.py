@@ -39,7 +39,7 @@ Out = Annotated[
         help="File to write (default: in the current folder, named after the left picture and the layout, "
         "such as left_view.png or left_wiggle.webp). Viewers recognise some layouts by a mark in the file "
         "name, which is added automatically: view.png becomes view_qs8x6a0.75.png for a quilt. .mpo and .jps "
-        "are 3-D pictures, .html is a 3-D page (--layout viewer).",
+        "are 3-D pictures, .html is a 3-D photo (--layout viewer).",
     ),
 ]
 Position = Annotated[
@@ -59,7 +59,8 @@ Layout = Annotated[
         help="Layout of several views in one picture: side_by_side, side_by_side_half, crossed, top_bottom, "
         "top_bottom_half, anaglyph_grey, anaglyph_colour, anaglyph_half_colour, anaglyph_dubois, rgbd, "
         "quilt or contact_sheet; an animation, sweep or wiggle, as .mp4 (extra 'video'), .gif or .webp; or "
-        "viewer, a page for any browser (.html) in which the mouse or a finger moves the viewpoint."
+        "viewer, a 3-D photo: a page for any browser (.html) in which the mouse or a finger moves the "
+        "viewpoint."
     ),
 ]
 Convergence = Annotated[
@@ -128,7 +129,7 @@ def view(  # noqa: PLR0913 - each is an option of the command line
     from stereoweave.matching.options import MatchOptions
     from stereoweave.outputs.view_files import ViewFile
     from stereoweave.pictures.prepare import prepare
-    from stereoweave.rendering.layouts import choose_layout
+    from stereoweave.rendering.layouts import choose_layout, is_converged
     from stereoweave.system.compiling_ahead import compile_ahead
 
     out = out or _name_view(pictures, layout)
@@ -142,7 +143,7 @@ def view(  # noqa: PLR0913 - each is an option of the command line
         up=up,
         forward=forward,
         strength=strength,
-        convergence_px=_parse_convergence_px(convergence or _default_convergence(name)),
+        convergence_px=_parse_convergence_px(convergence or ("auto" if is_converged(name) else "0")),
         layout_options=_parse_quilt(quilt),
         size_px=parse_largest_size_px(size),
         crops=_parse_crop(crop),
@@ -155,7 +156,8 @@ def view(  # noqa: PLR0913 - each is an option of the command line
     make_parent_folder(file.path)
     compile_ahead(*file.rehearsals)
     estimate = match(Backend(model=model, threads=threads, provider=provider).matcher(), pair, options)
-    typer.echo(f"{file.path}: {file.write(pair, estimate, prepared.pictures)}")
+    written = file.write(pair, estimate, prepared.pictures)
+    typer.echo(f"{file.path}: {written.description}")
     problems = find_problems(pair, estimate, prepared.alignment, prepared.remedy)
     for note in (*prepared.notes, *problems):
         typer.echo(note.format(running_options()))
@@ -200,14 +202,6 @@ def _parse_quilt(quilt: str | None) -> "LayoutOptions":
     if match is None:
         raise StereoweaveError(f"--quilt: expected columns and rows, such as 8x6, found {quilt!r}")
     return LayoutOptions(columns=int(match[1]), rows=int(match[2]))
-
-
-def _default_convergence(name: str | None) -> str:
-    """Return the --convergence of a layout for which none is given."""
-    from stereoweave.rendering.layouts import LAYOUTS
-
-    parallel = name is None or (name in LAYOUTS and not LAYOUTS[name].converged)
-    return "0" if parallel else "auto"
 
 
 def _parse_crop(crop: str | None) -> bool:

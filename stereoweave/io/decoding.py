@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Shaped, UInt8
 from PIL import Image, UnidentifiedImageError, features
 
-from stereoweave.errors import FormatError, reason
+from stereoweave.errors import FormatError, Remedy, reason
 from stereoweave.io import exif
 from stereoweave.io.similar_names import describe_missing
 from stereoweave.stereo import LONGEST_SIDE_PX
@@ -164,7 +164,10 @@ def _decoding(path: str | Path, expected: str = A_PICTURE) -> Iterator[None]:
     except UnidentifiedImageError as error:
         raise FormatError(f"{path}: expected {expected}, found {_describe_other(path)}") from error
     except Exception as error:
-        raise FormatError(f"{path}: expected {expected}, found {reason(error)}") from error
+        # The system's errors have a text of their own; any other one comes from damaged content.
+        by_system = isinstance(error, OSError) and error.strerror
+        advice = None if by_system or isinstance(error, MemoryError) else Remedy("copy it again")
+        raise FormatError(f"{path}: expected {expected}, found {reason(error)}", remedy=advice) from error
 
 
 def _describe_other(path: str | Path) -> str:
@@ -209,7 +212,9 @@ def _refuse_by_name(path: Path, head: bytes) -> None:
             "side"
         )
     elif brands or ending in _VIDEO_ENDINGS:
-        raise FormatError(f"{path}: expected {A_PICTURE}, found a video; use 'stereoweave video'")
+        raise FormatError(
+            f"{path}: expected {A_PICTURE}, found a video", remedy=Remedy("convert it as such", ("video",))
+        )
 
 
 def _refuse_by_content(path: Path, picture: Any, views: int) -> None:

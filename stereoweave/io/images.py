@@ -10,7 +10,7 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from stereoweave.arguments import check_kind
-from stereoweave.errors import FormatError, StereoweaveError
+from stereoweave.errors import FormatError, Remedy, StereoweaveError
 from stereoweave.io.decoding import read_picture
 from stereoweave.io.exif import read_orientation
 from stereoweave.io.files import replacing
@@ -50,7 +50,8 @@ def check_large_enough(path: str | Path, image: UInt8[np.ndarray, "h w 3"]) -> N
     if min(image.shape[:2]) < SMALLEST_SIDE_PX:
         raise FormatError(
             f"{path}: expected at least {SMALLEST_SIDE_PX}x{SMALLEST_SIDE_PX} pixels, "
-            f"found {_format_size(image)}"
+            f"found {_format_size(image)}",
+            remedy=Remedy("give larger pictures"),
         )
 
 

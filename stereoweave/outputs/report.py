@@ -7,7 +7,6 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 
 from stereoweave import __version__
@@ -34,6 +33,7 @@ from stereoweave.outputs.report_parts import (
 from stereoweave.outputs.viewer_scene import pack_scene
 from stereoweave.rendering.layouts import LAYOUTS, LayoutOptions, median_disparity_px, render_views
 from stereoweave.rendering.renderer import Renderer
+from stereoweave.rendering.scaling import fit_size, resize_nearest, scale_down
 from stereoweave.stereo import Estimate, StereoCamera, StereoPair, assume_camera
 
 # Views for browsers without WebGL; others show the view from any position.
@@ -173,10 +173,11 @@ def _collect_fields(
     pair: StereoPair, estimate: Estimate, summary: Summary, context: Context
 ) -> dict[str, object]:
     """Return the values of the template's fields by name."""
-    small, small_estimate = downscale(pair, estimate, _LONGER_SIDE_PX)
-    height, width = small.left.shape[:2]
+    size_px = fit_size(pair.left.shape, (_LONGER_SIDE_PX, _LONGER_SIDE_PX))
+    small, small_estimate = scale_down(pair, estimate, size_px)
+    width, height = size_px
     range_px = find_colour_range_px(np.atleast_2d(estimate.disparity_px[_seen(pair)]))
-    depth = colour_disparity(_resize_nearest(estimate.disparity_px, (width, height)), range_px)
+    depth = colour_disparity(resize_nearest(estimate.disparity_px, size_px), range_px)
     if small.left_seen is not None:
         depth[~small.left_seen] = 0
     views = _show_views(small, small_estimate, context.threads)
@@ -244,48 +245,19 @@ def _show_views(pair: StereoPair, estimate: Estimate, threads: int | None) -> _V
     )
 
 
-def downscale(pair: StereoPair, estimate: Estimate, longer_side_px: int) -> tuple[StereoPair, Estimate]:
-    """Downscale a pair and its estimate for display, to at most `longer_side_px` on the longer side.
-
-    Disparities are scaled too; the camera is dropped.
-    """
-    height, width = estimate.disparity_px.shape
-    scale = min(1.0, longer_side_px / max(height, width))
-    size = (max(1, round(width * scale)), max(1, round(height * scale)))
-    scale_x = np.float32(size[0] / width)
-    left, right = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (pair.left, pair.right))
-    left_seen, right_seen = (
-        None if seen is None else _resize_nearest(seen, size) for seen in (pair.left_seen, pair.right_seen)
-    )
-    return StereoPair(left=left, right=right, left_seen=left_seen, right_seen=right_seen), Estimate(
-        disparity_px=_resize_nearest(estimate.disparity_px, size) * scale_x,
-        right_disparity_px=_resize_nearest(estimate.right_disparity_px, size) * scale_x,
-        confidence=_resize_nearest(estimate.confidence, size),
-        occluded=_resize_nearest(estimate.occluded, size),
-    )
-
-
-def _resize_nearest(values: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Resize a map to (width, height) by nearest neighbour, as means across depth edges lie on no surface."""
-    numbers = values.view(np.uint8) if values.dtype == bool else values
-    return cv2.resize(numbers, size, interpolation=cv2.INTER_NEAREST_EXACT).view(values.dtype)
-
-
 def _downscale_map(pair: StereoPair, estimate: Estimate) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return disparity, confidence and occlusion for the read-out; the disparity stays in px of the pair.
 
     The confidence is NaN outside the left image's content.
     """
-    height, width = estimate.disparity_px.shape
-    scale = min(1.0, _LONGER_SIDE_OF_MAP_PX / max(height, width))
-    size = (max(1, round(width * scale)), max(1, round(height * scale)))
+    size_px = fit_size(pair.left.shape, (_LONGER_SIDE_OF_MAP_PX, _LONGER_SIDE_OF_MAP_PX))
     confidence = estimate.confidence
     if pair.left_seen is not None:
         confidence = np.where(pair.left_seen, confidence, np.float32(np.nan))
     return (
-        _resize_nearest(estimate.disparity_px, size),
-        _resize_nearest(confidence, size),
-        _resize_nearest(estimate.occluded, size),
+        resize_nearest(estimate.disparity_px, size_px),
+        resize_nearest(confidence, size_px),
+        resize_nearest(estimate.occluded, size_px),
     )
 
 

@@ -32,6 +32,14 @@ from stereoweave.system.compiling_ahead import Rehearsal
 from stereoweave.system.steps import step
 
 
+@dataclass(frozen=True)
+class WrittenView:
+    """What `ViewFile.write` wrote: a description for the user, and the image; None if it moves."""
+
+    description: str
+    image: UInt8[np.ndarray, "h w 3"] | None = None
+
+
 @dataclass(frozen=True, kw_only=True)
 class ViewFile:
     """A file of new views, with all its settings, which are checked at once.
@@ -63,7 +71,7 @@ class ViewFile:
     def __post_init__(self) -> None:
         check_position(0.5, up=self.up, forward=self.forward)
         check_positions(self._positions, self.strength)
-        if self.crops and not self._is_overlaid:
+        if self.crops and not can_crop(self.name):
             raise StereoweaveError(
                 f"expected only for a single view, an anaglyph or an animation, found with {self.name}",
                 setting="crop",
@@ -91,19 +99,14 @@ class ViewFile:
         }
         return [rehearse for rehearse, is_needed in needed.items() if is_needed]
 
-    @property
-    def _is_overlaid(self) -> bool:
-        """Whether the file shows its views in one place, each in full size."""
-        return self.name is None or self.name in ANIMATIONS or self.name.startswith("anaglyph")
-
     def add_mark(self, pair: StereoPair) -> "ViewFile":
         """Return the same file with the mark of its layout in its name."""
         if self.name not in LAYOUTS:
             return self
         return replace(self, path=add_mark(self.path, self.name, pair, self.layout_options))
 
-    def write(self, pair: StereoPair, estimate: Estimate, pictures: Iterable[Path]) -> str:
-        """Write the file from a pair and its estimate, and return a description of it for the user.
+    def write(self, pair: StereoPair, estimate: Estimate, pictures: Iterable[Path]) -> WrittenView:
+        """Write the file from a pair and its estimate.
 
         `pictures` are the pair's files, of which the viewer shows the names.
         """
@@ -129,30 +132,32 @@ class ViewFile:
         return find_common_part(renderer, ends, up=self.up, forward=self.forward)
 
     @step("rendering the view")
-    def _write_view(self, renderer: Renderer) -> str:
+    def _write_view(self, renderer: Renderer) -> WrittenView:
         part = self._find_part(renderer)
         view = renderer.view(self.position, up=self.up, forward=self.forward)
-        write_image(self.path, np.ascontiguousarray(view.image[part]))
-        invented_percent = 100 * (~view.drawn[part]).mean()
-        return f"view at {self.position:g}, {invented_percent:.1f} % of it seen by neither camera"
+        image = _cut(view.image, part)
+        write_image(self.path, image)
+        unseen_percent = 100 * (~view.drawn[part]).mean()
+        text = f"view at {self.position:g}, {unseen_percent:.1f} % of it seen by neither camera"
+        return WrittenView(text, image)
 
     @step("rendering views")
-    def _write_layout(self, renderer: Renderer, name: str) -> str:
+    def _write_layout(self, renderer: Renderer, name: str) -> WrittenView:
         part = self._find_part(renderer)
         if name in LAYOUTS:
-            picture = np.ascontiguousarray(LAYOUTS[name].compose(renderer, self.layout_options)[part])
-            write_picture(self.path, picture)
-            return f"{name}, {picture.shape[1]}x{picture.shape[0]} px"
+            image = _cut(LAYOUTS[name].compose(renderer, self.layout_options), part)
+            write_picture(self.path, image)
+            return WrittenView(f"{name}, {image.shape[1]}x{image.shape[0]} px", image)
         motion = ANIMATIONS[name]
         turns = motion.turns(self.path)
         frames = render_views(renderer, motion.positions * turns)
         write_animation(self.path, (_cut(frame, part) for frame in frames), motion.frame_ms)
         count = len(motion.positions) * turns
-        return f"{name}, {count} frames in {count * motion.frame_ms / 1000:g} s"
+        return WrittenView(f"{name}, {count} frames in {count * motion.frame_ms / 1000:g} s")
 
     def _write_viewer(
         self, pair: StereoPair, estimate: Estimate, plane_px: float, pictures: Iterable[Path]
-    ) -> str:
+    ) -> WrittenView:
         page = make_viewer(
             pair,
             estimate,
@@ -163,8 +168,13 @@ class ViewFile:
             threads=self.threads,
         )
         write_viewer(self.path, page)
-        return f"{VIEWER}, {len(page) / 1e6:.2g} MB; open it in a browser"
+        return WrittenView(f"{VIEWER}, {len(page) / 1e6:.2g} MB; open it in a browser")
 
 
-def _cut(frame: UInt8[np.ndarray, "h w 3"], part: tuple[slice, slice]) -> UInt8[np.ndarray, "h2 w2 3"]:
-    return np.ascontiguousarray(frame[part])
+def can_crop(name: str | None) -> bool:
+    """Return whether a layout shows its views in one place, each in full size, so that it can be cropped."""
+    return name is None or name in ANIMATIONS or name.startswith("anaglyph")
+
+
+def _cut(image: UInt8[np.ndarray, "h w 3"], part: tuple[slice, slice]) -> UInt8[np.ndarray, "h2 w2 3"]:
+    return np.ascontiguousarray(image[part])

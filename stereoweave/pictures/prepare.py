@@ -40,7 +40,8 @@ class Request:
     def __post_init__(self) -> None:
         if self.calibration and not (self.focal_px is None and self.baseline_m is None):
             raise StereoweaveError(
-                f"{self.calibration}: expected either a calibration or focal length and baseline, found both"
+                f"{self.calibration}: expected either a calibration or focal length and baseline, found both",
+                remedy=Remedy("omit one of them", ("calibration", "focal_px", "baseline_m")),
             )
 
 

@@ -280,6 +280,11 @@ def choose_layout(path: str | Path, name: str | None) -> str | None:
     return name
 
 
+def is_converged(name: str | None) -> bool:
+    """Return whether the middle of the scene has no parallax by default in a layout; see `Layout`."""
+    return name == VIEWER or name in ANIMATIONS or (name in LAYOUTS and LAYOUTS[name].converged)
+
+
 def check_positions(positions: Iterable[float], strength: float) -> None:
     """Raise a StereoweaveError if a view cannot be rendered from one of these positions at this strength."""
     for position in positions:

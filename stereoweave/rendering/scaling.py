@@ -30,14 +30,14 @@ def scale_down(pair: StereoPair, estimate: Estimate, size_px: tuple[int, int]) -
     left, right = (
         cv2.resize(image, size_px, interpolation=cv2.INTER_AREA) for image in (pair.left, pair.right)
     )
-    seen = [None if x is None else _resize_nearest(x, size_px) for x in (pair.left_seen, pair.right_seen)]
+    seen = [None if x is None else resize_nearest(x, size_px) for x in (pair.left_seen, pair.right_seen)]
     camera = None if pair.camera is None else _scale_camera(pair.camera, scale_x, scale_y)
     small = StereoPair(left=left, right=right, camera=camera, left_seen=seen[0], right_seen=seen[1])
     return small, Estimate(
-        disparity_px=_resize_nearest(estimate.disparity_px, size_px) * np.float32(scale_x),
-        right_disparity_px=_resize_nearest(estimate.right_disparity_px, size_px) * np.float32(scale_x),
-        confidence=_resize_nearest(estimate.confidence, size_px),
-        occluded=_resize_nearest(estimate.occluded, size_px),
+        disparity_px=resize_nearest(estimate.disparity_px, size_px) * np.float32(scale_x),
+        right_disparity_px=resize_nearest(estimate.right_disparity_px, size_px) * np.float32(scale_x),
+        confidence=resize_nearest(estimate.confidence, size_px),
+        occluded=resize_nearest(estimate.occluded, size_px),
     )
 
 
@@ -52,7 +52,10 @@ def _scale_camera(camera: StereoCamera, scale_x: float, scale_y: float) -> Stere
     )
 
 
-def _resize_nearest(values: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
-    """Resize a map by nearest neighbour, because means across depth edges lie on no surface."""
+def resize_nearest(values: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
+    """Resize a map to a width and height by nearest neighbour.
+
+    Means across depth edges would lie on no surface.
+    """
     numbers = values.view(np.uint8) if values.dtype == bool else values
     return cv2.resize(numbers, size_px, interpolation=cv2.INTER_NEAREST_EXACT).view(values.dtype)

@@ -1,4 +1,4 @@
-"""Long work of the page in Chromium: visitors at once, cancelling, leaving, and 3-D pictures and films."""
+"""Long work of the page in Chromium: visitors at once, cancelling, leaving, and 3-D pictures and videos."""
 
 import io
 import re
@@ -17,17 +17,20 @@ from PIL import Image
 from playwright.sync_api import Browser
 from video_examples import example_pairs, packed, write_video
 
-from stereoweave.app.film import Film, convert_film
-from stereoweave.app.film_tab import label_of
-from stereoweave.app.stereo_pictures import KINDS
+from stereoweave.app.stereo_pictures import AUTOMATIC_PX, FULL_PX, KINDS, Wish, write_stereo_picture
+from stereoweave.app.video_tab import label_of
+from stereoweave.app.video_upload import VideoUpload, convert_upload
 from stereoweave.errors import FormatError
 from stereoweave.io.images import read_image, write_image
 from stereoweave.matching.backend import Backend
+from stereoweave.matching.options import MatchOptions
+from stereoweave.outputs.run import Result, run
+from stereoweave.pictures.prepare import Request, prepare
 
 TEXTURED = Path(__file__).resolve().parents[1] / "textured_pair"
 WIDTH, HEIGHT = 320, 240
 WAIT_S = 60
-AT_WORK = re.compile("looking through the film|frame \\d")
+AT_WORK = re.compile("looking through the video|frame \\d")
 
 pytestmark = [pytest.mark.system, pytest.mark.needs_chromium]
 
@@ -73,11 +76,11 @@ def large_pair(tmp_path_factory) -> dict[str, Path]:
 
 
 @pytest.fixture(scope="module")
-def endless_film(tmp_path_factory) -> Path:
-    """Write a film of six minutes, whose conversion takes longer."""
-    film = tmp_path_factory.mktemp("film") / "endless.mp4"
+def endless_video(tmp_path_factory) -> Path:
+    """Write a video of six minutes, whose conversion takes longer."""
+    video = tmp_path_factory.mktemp("video") / "endless.mp4"
     frames = [packed(*pair) for pair in example_pairs(50)]
-    return write_video(film, frames * 180)
+    return write_video(video, frames * 180)
 
 
 def workers_of(pid: int) -> set[int]:
@@ -93,9 +96,9 @@ def wait_until(condition) -> None:
         time.sleep(0.05)
 
 
-def ask(file: Path, start_s: float | None) -> Film:
-    """Return a visitor's request for the depth of a film."""
-    return Film(
+def ask(file: Path, start_s: float | None) -> VideoUpload:
+    """Return a visitor's request for the depth of a video."""
+    return VideoUpload(
         files=(file,),
         format="side_by_side",
         output="depth",
@@ -105,13 +108,13 @@ def ask(file: Path, start_s: float | None) -> Film:
     )
 
 
-def begin_endless(visit: Visit, film: Path, pid: int) -> set[int]:
-    """Begin to convert a film without end; return the process that does it."""
-    visit.open("Film")
-    visit.give(film_left=film)
+def begin_endless(visit: Visit, video: Path, pid: int) -> set[int]:
+    """Begin to convert a video without end; return the process that does it."""
+    visit.open("Video")
+    visit.give(video_left=video)
     before = workers_of(pid)
-    visit.page.click("#film-whole")
-    visit.page.locator("#film-status").get_by_text(AT_WORK).wait_for()
+    visit.page.click("#video-whole")
+    visit.page.locator("#video-status").get_by_text(AT_WORK).wait_for()
     return workers_of(pid) - before or workers_of(pid)
 
 
@@ -153,29 +156,40 @@ def test_after_cancelling_the_result_before_stays(visit, pair, large_pair):
     assert "Cancelled" in visit.page.locator("#status").inner_text()
 
 
-def test_a_closed_tab_ends_its_film_and_the_next_visitor_s_begins(server, browser, endless_film, tmp_path):
+def test_a_closed_tab_ends_its_video_and_the_next_visitor_s_begins(server, browser, endless_video, tmp_path):
     pid, address = server
     with visiting(browser, address) as leaving:
-        begin_endless(leaving, endless_film, pid)
+        begin_endless(leaving, endless_video, pid)
         busy = workers_of(pid)
     with visiting(browser, address) as next_one:
         wait_until(lambda: busy - workers_of(pid))
-        begin_endless(next_one, endless_film, pid)
-        next_one.page.click("#film-cancel")
-        next_one.page.locator("#film-status").get_by_text("Cancelled").wait_for()
+        begin_endless(next_one, endless_video, pid)
+        next_one.page.click("#video-cancel")
+        next_one.page.locator("#video-status").get_by_text("Cancelled").wait_for()
 
 
-def test_a_waiting_job_can_be_cancelled(server, browser, endless_film):
+def test_a_waiting_job_can_be_cancelled(server, browser, endless_video):
     pid, address = server
     with visiting(browser, address) as first, visiting(browser, address) as second:
-        begin_endless(first, endless_film, pid)
-        second.open("Film")
-        second.give(film_left=endless_film)
-        second.page.click("#film-preview")
-        second.page.locator("#film-status").get_by_text("queue").wait_for()
-        second.page.click("#film-cancel")
-        second.page.locator("#film-status").get_by_text("Cancelled").wait_for()
-        first.page.locator("#film-status").get_by_text(AT_WORK).wait_for()
+        begin_endless(first, endless_video, pid)
+        second.open("Video")
+        second.give(video_left=endless_video)
+        second.page.click("#video-preview")
+        second.page.locator("#video-status").get_by_text("queue").wait_for()
+        second.page.click("#video-cancel")
+        second.page.locator("#video-status").get_by_text("Cancelled").wait_for()
+        first.page.locator("#video-status").get_by_text(AT_WORK).wait_for()
+
+
+def test_a_job_cancelled_at_once_shows_no_error(visit, endless_video):
+    visit.open("Video")
+    visit.give(video_left=endless_video)
+    for _ in range(3):
+        visit.page.click("#video-whole")
+        visit.page.click("#video-cancel")
+        visit.page.locator("#video-status").get_by_text("Cancelled").wait_for()
+        visit.page.wait_for_timeout(1000)
+        assert not visit.page.locator("#video-status .error").is_visible()
 
 
 # By kind: the picture's format, and its width and height.
@@ -197,6 +211,7 @@ STILLS = {
     "contact_sheet": ("JPEG", (WIDTH // 3 * 3, HEIGHT // 3 * 3)),
     "rgbd": ("JPEG", (2 * WIDTH, HEIGHT)),
     "depth_map": ("PNG", (WIDTH, HEIGHT)),
+    "view": ("JPEG", (WIDTH, HEIGHT)),
 }
 FRAMES = {"wiggle": 12, "sweep": 80, "mpo": 2}
 
@@ -208,91 +223,178 @@ def answered(browser, server, pair) -> Iterator[Visit]:
         visit.give(**pair)
         visit.find()
         visit.open("3-D picture")
-        visit.page.locator("#picture").get_by_text("anaglyph_dubois").wait_for()
+        visit.page.locator("#picture").get_by_text("left_anaglyph_dubois").wait_for()
         yield visit
 
 
-@pytest.mark.parametrize("kind", KINDS)
+def make_picture(visit: Visit, kind: str, folder: Path) -> Path:
+    """Choose a kind of 3-D picture and download it."""
+    visit.choose("kind", KINDS[kind].label)
+    visit.page.locator("#viewing").get_by_text(KINDS[kind].viewing).wait_for()
+    visit.page.locator("#picture").get_by_text(f" left_{kind}").wait_for()
+    return visit.download("picture", folder)
+
+
+@pytest.mark.parametrize("kind", STILLS)
 def test_each_3_d_picture_opens_with_its_format_and_size(answered, kind, tmp_path):
-    answered.choose("kind", KINDS[kind].label)
-    answered.page.locator("#viewing").get_by_text(KINDS[kind].viewing).wait_for()
-    stem = "picture" if kind in ("mpo", "jps") else kind
-    answered.page.locator("#picture").get_by_text(f" {stem}").wait_for()
-    file = answered.download("picture", tmp_path)
-    with Image.open(file) as picture:
+    with Image.open(make_picture(answered, kind, tmp_path)) as picture:
         assert (picture.format, picture.size) == STILLS[kind]
         assert getattr(picture, "n_frames", 1) == FRAMES.get(kind, 1)
     assert answered.picture("preview").std() > 10
 
 
+def test_all_kinds_of_3_d_pictures_are_tested():
+    assert {*STILLS, "viewer"} == set(KINDS)
+
+
+def test_a_3_d_photo_moves_in_the_page_and_is_one_file(answered, tmp_path):
+    photo = make_picture(answered, "viewer", tmp_path)
+    (frame,) = answered.page.frames[1:]
+    frame.wait_for_function("Boolean(window.stereoweaveViewer)")
+    assert frame.evaluate("stereoweaveViewer.view.scene.size_px") == [WIDTH, HEIGHT]
+    assert not answered.page.locator("#preview").is_visible()
+    assert photo.name == "left_viewer.html"
+    shown = answered.page.locator("#photo iframe").get_attribute("srcdoc")
+    assert shown == photo.read_text(encoding="utf-8")
+
+
 @pytest.mark.parametrize("kind", ["wiggle", "sweep"])
-def test_an_animation_moves_in_its_preview(answered, kind):
-    answered.choose("kind", KINDS[kind].label)
-    answered.page.locator("#picture").get_by_text(f" {kind}").wait_for()
+def test_an_animation_moves_in_its_preview(answered, kind, tmp_path):
+    make_picture(answered, kind, tmp_path)
     with Image.open(io.BytesIO(answered.fetch("preview"))) as preview:
         assert getattr(preview, "n_frames", 1) == FRAMES[kind]
 
 
 def test_the_halves_of_a_crossed_picture_are_the_right_and_the_left_view(answered, pair, tmp_path):
-    answered.choose("kind", KINDS["crossed"].label)
-    answered.page.locator("#picture").get_by_text(" crossed").wait_for()
-    crossed = read_image(answered.download("picture", tmp_path)).astype(float)
+    crossed = read_image(make_picture(answered, "crossed", tmp_path)).astype(float)
     for side, half in zip(("right", "left"), np.split(crossed, 2, axis=1), strict=True):
         assert np.abs(half - read_image(pair[side])).mean() < 5
 
 
-def test_five_seconds_of_a_film_are_shown_as_a_preview(visit, tmp_path):
-    film = write_video(tmp_path / "film.mp4", [packed(*pair) for pair in example_pairs(50)] * 4)  # 8 s
-    visit.open("Film")
-    visit.give(film_left=film)
-    visit.choose("film-output", "Anaglyph")
-    visit.page.locator("#film-start input").fill("2")
-    visit.page.click("#film-preview")
-    visit.page.locator("#film-status").get_by_text("125 frames of 160×96 px, 5.0 s").wait_for()
-    visit.page.wait_for_function("document.querySelector('#film video')?.videoWidth === 160")
-    assert visit.page.evaluate("document.querySelector('#film video').duration") == pytest.approx(5, abs=0.05)
-    with av.open(str(visit.download("film-file", tmp_path))) as shown:
+def test_a_view_is_that_of_the_slider(answered, pair, tmp_path):
+    answered.move("1")
+    answered.open("3-D picture")
+    view = read_image(make_picture(answered, "view", tmp_path)).astype(float)
+    assert np.abs(view - read_image(pair["right"])).mean() < 5
+
+
+@pytest.fixture(scope="module")
+def result(pair) -> Result:
+    prepared = prepare(list(pair.values()), Request())
+    return run(prepared, Backend().matcher(), MatchOptions())
+
+
+@pytest.mark.parametrize(
+    ("kind", "size_px"),
+    [
+        ("anaglyph_grey", (160, 120)),
+        ("side_by_side", (320, 120)),
+        ("wiggle", (160, 120)),
+        ("view", (160, 120)),
+    ],
+)
+def test_a_3_d_picture_of_a_smaller_size_has_smaller_views(result, kind, size_px, tmp_path):
+    made = write_stereo_picture(Wish(kind=kind, longer_side_px=160), result, tmp_path / "a", lambda *_: None)
+    with Image.open(made.file) as picture:
+        assert picture.size == size_px
+
+
+def test_a_3_d_photo_of_a_smaller_size_is_smaller(result, tmp_path):
+    small, whole = (
+        write_stereo_picture(
+            Wish(kind="viewer", longer_side_px=side), result, tmp_path / f"{side}", lambda *_: None
+        ).file.stat()
+        for side in (160, AUTOMATIC_PX)
+    )
+    assert small.st_size < 0.7 * whole.st_size
+
+
+def test_borders_are_cut_off_only_on_request_and_where_views_lie_upon_each_other(result, tmp_path):
+    def width_of(kind: str, crops: bool) -> int:
+        wish = Wish(kind=kind, crops=crops, position=1.5).plain()
+        made = write_stereo_picture(wish, result, tmp_path / f"{kind}{crops}", lambda *_: None)
+        with Image.open(made.file) as picture:
+            return picture.width
+
+    assert width_of("view", False) == WIDTH > width_of("view", True) > WIDTH - 20
+    assert width_of("depth_map", True) == width_of("side_by_side", True) / 2 == WIDTH
+
+
+def test_animations_are_small_enough_to_send_unless_the_full_size_is_asked_for():
+    assert Wish(kind="wiggle").size_px == (800, 800)
+    assert Wish(kind="wiggle", longer_side_px=FULL_PX).size_px == (FULL_PX, FULL_PX)
+    assert Wish(kind="crossed").size_px == (FULL_PX, FULL_PX)
+
+
+def test_a_size_and_a_crop_are_chosen_in_the_page(answered, tmp_path):
+    answered.move("1.5")
+    answered.open("3-D picture")
+    make_picture(answered, "view", tmp_path)
+    answered.page.get_by_label("Cut off borders").check()
+    answered.page.wait_for_function(
+        "width => document.querySelector('#preview img')?.naturalWidth < width", arg=WIDTH
+    )
+    answered.page.get_by_label("Cut off borders").uncheck()
+    make_picture(answered, "side_by_side", tmp_path)
+    assert not answered.page.locator("#crop").is_visible()
+
+
+def test_five_seconds_of_a_video_are_shown_as_a_preview(visit, tmp_path):
+    video = write_video(tmp_path / "video.mp4", [packed(*pair) for pair in example_pairs(50)] * 4)  # 8 s
+    visit.open("Video")
+    visit.give(video_left=video)
+    visit.choose("video-output", "Anaglyph")
+    visit.page.locator("#video-start input").fill("2")
+    visit.page.click("#video-preview")
+    visit.page.locator("#video-status").get_by_text("125 frames of 160×96 px, 5.0 s").wait_for()
+    visit.page.wait_for_function("document.querySelector('#video video')?.videoWidth === 160")
+    assert visit.page.evaluate("document.querySelector('#video video').duration") == pytest.approx(
+        5, abs=0.05
+    )
+    with av.open(str(visit.download("video-file", tmp_path))) as shown:
         frames = [frame.to_ndarray(format="rgb24") for frame in shown.decode(video=0)]
     assert len(frames) == 125
     assert visit.refused == []
 
 
-def test_a_file_that_is_no_film_is_one_line(visit, tmp_path):
-    (tmp_path / "notes.mp4").write_text("no film")
-    visit.open("Film")
-    visit.page.click("#film-preview")
-    said = visit.page.locator("#film-status .notice.problem")
-    said.get_by_text("expected a film with both views, or a left and a right film, found none").wait_for()
-    visit.give(film_left=tmp_path / "notes.mp4")
-    visit.page.click("#film-preview")
+def test_a_file_that_is_no_video_is_one_line(visit, tmp_path):
+    (tmp_path / "notes.mp4").write_text("no video")
+    visit.open("Video")
+    visit.page.click("#video-preview")
+    said = visit.page.locator("#video-status .notice.problem")
+    said.get_by_text("expected a video with both views, or a left and a right video, found none").wait_for()
+    visit.give(video_left=tmp_path / "notes.mp4")
+    visit.page.click("#video-preview")
     said.get_by_text("notes.mp4: expected ").wait_for()
     assert "/" not in said.inner_text()
 
 
-def test_a_film_s_frames_and_the_time_left_are_reported(tmp_path):
-    film = write_video(tmp_path / "film.mp4", [packed(*pair) for pair in example_pairs(6)])
+def test_a_video_s_frames_and_the_time_left_are_reported(tmp_path):
+    video = write_video(tmp_path / "video.mp4", [packed(*pair) for pair in example_pairs(6)])
     said: list[tuple[float, str]] = []
-    made = convert_film(ask(film, start_s=0.08), tmp_path, lambda share, what: said.append((share, what)))
+    made = convert_upload(ask(video, start_s=0.08), tmp_path, lambda share, what: said.append((share, what)))
     shares, texts = zip(*said, strict=True)
     assert list(shares) == sorted(shares)
     assert texts[-4] == "frame 1 of 4"
     assert re.fullmatch(r"frame 4 of 4, about \d+ (s|min|h) left", texts[-1])
     assert re.search(
-        r"4 frames of 160×96 px, 0.2 s.*The whole film takes about \d+ (s|min|h)\.", made.summary
+        r"4 frames of 160×96 px, 0.2 s.*The whole video takes about \d+ (s|min|h)\.", made.summary
     )
     assert made.warnings == []
 
 
 @pytest.mark.parametrize("ending", ["m3u8", "mp4", "ffconcat"])
-def test_a_playlist_does_not_read_another_film(tmp_path, ending):
+def test_a_playlist_does_not_read_another_video(tmp_path, ending):
     secret = write_video(tmp_path / "secret.mp4", [packed(*pair) for pair in example_pairs(5)])
     playlist = tmp_path / f"playlist.{ending}"
     if ending == "ffconcat":
         playlist.write_text("ffconcat version 1.0\nfile secret.mp4\n")
     else:
         playlist.write_text(f"#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\n{secret}\n#EXT-X-ENDLIST\n")
-    with pytest.raises(FormatError, match=rf"^playlist\.{ending}: expected a film \(MP4.*found another kind"):
-        convert_film(ask(playlist, start_s=None), tmp_path, lambda share, what: None)
+    with pytest.raises(
+        FormatError, match=rf"^playlist\.{ending}: expected a video \(MP4.*found another kind"
+    ):
+        convert_upload(ask(playlist, start_s=None), tmp_path, lambda share, what: None)
 
 
 def test_pictures_that_do_not_fit_get_a_banner(visit, tmp_path):

@@ -53,6 +53,14 @@ def file_data(path: Any, **more: Any) -> dict[str, Any]:
     return {"path": path, "meta": {"_type": "gradio.FileData"}, **more}
 
 
+_VIDEO_FORM = {
+    "video-layout": "detected",
+    "video-model": "small",
+    "video-output": "depth",
+    "video-start": 0,
+}
+
+
 class Visitor:
     """Client of the page that sends form requests or arbitrary ones."""
 
@@ -77,7 +85,9 @@ class Visitor:
     def press(self, button: str = "find", **given: Any) -> dict[str, Any]:
         """Return the request body for a button of the form, with some fields filled in."""
         number, inputs = self._inputs[button]
-        form = {"model": "small", "rectify": True, "layout": "detected", "position": 0.5} | given
+        form = (
+            {"model": "small", "rectify": True, "layout": "detected", "position": 0.5} | _VIDEO_FORM | given
+        )
         data = [form.get(self._fields[part]) for part in inputs]
         return {"data": data, "fn_index": number, "session_hash": uuid4().hex}
 

@@ -39,7 +39,7 @@ class Visit:
 
     def take_back(self) -> None:
         """Clear the fields for pictures."""
-        clear = self.page.get_by_label("Clear")
+        clear = self.page.get_by_label("Clear").filter(visible=True)
         while before := clear.count():
             clear.first.click()
             expect(clear).not_to_have_count(before)

@@ -163,7 +163,8 @@ def test_a_picture_of_a_huge_declared_size_is_refused(tmp_path):
 def test_a_picture_under_32_pixels_is_refused(tmp_path, width_px, height_px):
     images.write_image(tmp_path / "small.png", np.zeros((height_px, width_px, 3), np.uint8))
     message = refusal_of(images.read_image, tmp_path / "small.png")
-    assert message.endswith(f"expected at least 32x32 pixels, found {width_px}x{height_px}")
+    size = f"{width_px}x{height_px}"
+    assert message.endswith(f"expected at least 32x32 pixels, found {size}; give larger pictures")
 
 
 def test_a_picture_of_32_pixels_is_read(tmp_path):

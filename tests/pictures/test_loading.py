@@ -644,8 +644,8 @@ def box(*brands):
         ("a.jpg", box(b"mif1", b"heic"), "HEIC, the format of spatial photographs"),
         # In the file's head, after the version of the first brand, are 12 others.
         ("a.jpg", box(b"isom", *[b"iso2"] * 11, b"heic"), "HEIC, the format of spatial photographs"),
-        ("a.mov", box(b"qt  "), "a video; use 'stereoweave video'"),
-        ("a.mkv", b"\x1a\x45\xdf\xa3", "a video; use 'stereoweave video'"),
+        ("a.mov", box(b"qt  "), "a video; convert it as such (video)"),
+        ("a.mkv", b"\x1a\x45\xdf\xa3", "a video; convert it as such (video)"),
         ("a.CR2", b"II\x2a\0", "a camera raw file"),
         ("a.dng", b"II\x2a\0", "a camera raw file"),
         ("a.jpg", b"PK\x03\x04" + bytes(1000), "another type of file"),

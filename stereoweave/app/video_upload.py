@@ -1,4 +1,4 @@
-"""Conversion of an uploaded stereo film, or of some seconds of it, without the user interface."""
+"""Conversion of an uploaded stereo video, or of some seconds of it, without the user interface."""
 
 import io
 import time
@@ -13,6 +13,7 @@ from rich.console import Console
 from stereoweave.app.session import check_uploads
 from stereoweave.errors import FormatError, NameOf, StereoweaveError
 from stereoweave.io.animation import require_video_extra
+from stereoweave.io.decoding import open_picture
 from stereoweave.matching.backend import Backend
 from stereoweave.rendering.layouts import LayoutOptions, add_mark
 from stereoweave.stereo import StereoPair
@@ -25,13 +26,13 @@ if TYPE_CHECKING:
 PREVIEW_S = 5
 # FFmpeg's names of containers that refer to no other file.
 _CONTAINERS = ("mp4", "matroska", "avi", "mpegts", "mpeg", "asf", "flv", "ogg")
-# The share of the work that looks for the disparities of the whole film, before the conversion.
+# The share of the work that looks for the disparities of the whole video, before the conversion.
 _SURVEY_SHARE = 0.15
 
 
 @dataclass(frozen=True)
 class Output:
-    """What a film is converted to: its label, how to look at it, and the settings of `VideoJob`."""
+    """What a video is converted to: its label, how to look at it, and the settings of `VideoJob`."""
 
     label: str
     viewing: str
@@ -40,7 +41,7 @@ class Output:
 
 OUTPUTS: dict[str, Output] = {
     "depth": Output("Depth in colour", "Red is near, blue is far.", {"depth": True}),
-    "between": Output("View from between the cameras", "An ordinary film.", {"position": 0.5}),
+    "between": Output("View from between the cameras", "An ordinary video.", {"position": 0.5}),
     "side_by_side": Output(
         "Side by side", "For VR headsets: the left eye's view is on the left.", {"layout": "side_by_side"}
     ),
@@ -63,14 +64,14 @@ OUTPUTS: dict[str, Output] = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class Film:
-    """A visitor's uploaded film and settings.
+class VideoUpload:
+    """A visitor's uploaded video and settings.
 
     Attributes:
         files: One file with both views, or a left and a right one.
         format: Frame packing; None to detect it.
         output: What to make, a name in `OUTPUTS`.
-        start_s: Where a preview of `PREVIEW_S` seconds begins; None to convert the whole film.
+        start_s: Where a preview of `PREVIEW_S` seconds begins; None to convert the whole video.
         backend: The network.
         name_of: The form's names for settings.
     """
@@ -84,60 +85,88 @@ class Film:
 
 
 @dataclass(frozen=True)
-class ConvertedFilm:
-    """A converted film: its file, a line about it, and warnings."""
+class ConvertedVideo:
+    """A converted video: its file, a line about it, and warnings."""
 
     file: Path
     summary: str
     warnings: list[str]
 
 
-def convert_film(film: Film, folder: Path, report: Callable[[float, str], None]) -> ConvertedFilm:
-    """Convert an uploaded film, or a part of it; the result is written to `folder`.
+def convert_upload(upload: VideoUpload, folder: Path, report: Callable[[float, str], None]) -> ConvertedVideo:
+    """Convert an uploaded video, or a part of it; the result is written to `folder`.
 
     Raises:
-        StereoweaveError: See `open_video` and `convert_video`; or there is no film, or it has expired.
+        StereoweaveError: See `open_video` and `convert_video`; or there is no video, or it has expired.
     """
-    if not film.files:
-        raise StereoweaveError("expected a film with both views, or a left and a right film, found none")
-    check_uploads(film.files)
-    for file in film.files:
-        _check_container(file)
-    with require_video_extra("a film"):
+    _check_upload(upload)
+    with require_video_extra("a video"):
         from stereoweave.video.convert import convert_video
         from stereoweave.video.job import VideoJob
         from stereoweave.video.reader import open_video
-    report(0.0, "opening the film")
-    video = open_video(film.files, film.format)
+    report(0.0, "opening the video")
+    video = open_video(upload.files, upload.format)
     whole_count = video.frame_count
-    if film.start_s is not None:
-        video = video.excerpt(film.start_s, PREVIEW_S)
+    if upload.start_s is not None:
+        video = video.excerpt(upload.start_s, PREVIEW_S)
     video.on_frame = shown = _FrameReport(video.frame_count, report)
-    job = VideoJob(**OUTPUTS[film.output].settings, backend=film.backend, name_of=film.name_of)
+    job = VideoJob(**OUTPUTS[upload.output].settings, backend=upload.backend, name_of=upload.name_of)
     console = _NoteConsole()
-    out = _name_file(film, video, folder)
-    tally = convert_video(video, film.files, out, job, console)
-    summary = _describe(film, video)
-    if film.start_s is not None:
+    out = _name_file(upload, video, folder)
+    tally = convert_video(video, upload.files, out, job, console)
+    summary = _describe(upload, video)
+    if upload.start_s is not None:
         whole_s = shown.spent_s / video.frame_count * whole_count
-        summary += f" A preview has no sound. The whole film takes about {format_duration(whole_s)}."
-    return ConvertedFilm(out, summary, [*console.lines, *_describe_problems(tally)])
+        summary += f" A preview has no sound. The whole video takes about {format_duration(whole_s)}."
+    return ConvertedVideo(out, summary, [*console.lines, *_describe_problems(tally)])
+
+
+def _check_upload(upload: VideoUpload) -> None:
+    """Raise a StereoweaveError if there is no video, it has expired, or a setting does not fit it."""
+    if not upload.files:
+        raise StereoweaveError(
+            "expected a video with both views, or a left and a right video, found none; drop it on the form"
+        )
+    check_uploads(upload.files)
+    if upload.format and len(upload.files) > 1:
+        raise StereoweaveError(
+            "expected one video that holds both views, found two videos; choose detected, or give one video",
+            setting="format",
+        )
+    if upload.start_s is not None and upload.start_s < 0:
+        raise StereoweaveError(
+            f"expected a time from 0 s, the start, found {upload.start_s:g} s", setting="start_s"
+        )
+    for file in upload.files:
+        _check_container(file)
 
 
 def _check_container(file: Path) -> None:
-    """Raise FormatError unless a film holds its own content.
+    """Raise FormatError unless a video holds its own content.
 
     Playlists and the like name other files, which FFmpeg would read wherever they lie on the disk.
     """
-    with require_video_extra("a film"):
+    with require_video_extra("a video"):
         import av
     try:
         av.open(str(file), options={"format_whitelist": ",".join(_CONTAINERS)}).close()
     except av.error.FFmpegError as error:
+        found = (
+            "a picture; give it under “Pictures”"
+            if _is_picture(file)
+            else "another kind of file, or a damaged one; copy it again, or save it as MP4"
+        )
         raise FormatError(
-            f"{file.name}: expected a film (MP4, MOV, MKV, WebM, AVI, MPEG, WMV, FLV or OGG), found another "
-            "kind of file, or a damaged one"
+            f"{file.name}: expected a video (MP4, MOV, MKV, WebM, AVI, MPEG, WMV, FLV or OGG), found {found}"
         ) from error
+
+
+def _is_picture(file: Path) -> bool:
+    try:
+        with open_picture(file):
+            return True
+    except FormatError:
+        return False
 
 
 class _FrameReport:
@@ -151,7 +180,7 @@ class _FrameReport:
             self._passes, self._begin_s = self._passes + 1, time.monotonic()
         share = number / self._count
         if self._passes == 1:
-            self._report(_SURVEY_SHARE * share, "looking through the film")
+            self._report(_SURVEY_SHARE * share, "looking through the video")
             return
         left = number and f", about {format_duration(self.spent_s / number * (self._count - number))} left"
         self._report(
@@ -176,24 +205,24 @@ class _NoteConsole(Console):
         self.lines += [line for line in objects if isinstance(line, str)]
 
 
-def _name_file(film: Film, video: "StereoVideo", folder: Path) -> Path:
+def _name_file(upload: VideoUpload, video: "StereoVideo", folder: Path) -> Path:
     """Return the file to write, whose name has the mark by which players recognise a layout."""
-    kind = "" if film.start_s is None else "_preview"
-    file = folder / f"{film.files[0].stem}_{film.output}{kind}.mp4"
-    layout = OUTPUTS[film.output].settings.get("layout")
+    kind = "" if upload.start_s is None else "_preview"
+    file = folder / f"{upload.files[0].stem}_{upload.output}{kind}.mp4"
+    layout = OUTPUTS[upload.output].settings.get("layout")
     if layout is None:
         return file
     blank = np.broadcast_to(np.uint8(0), (*reversed(video.size_px), 3))
     return add_mark(file, layout, StereoPair(left=blank, right=blank), LayoutOptions())
 
 
-def _describe(film: Film, video: "StereoVideo") -> str:
-    """Describe a converted film in one line."""
+def _describe(upload: VideoUpload, video: "StereoVideo") -> str:
+    """Describe a converted video in one line."""
     width, height = video.size_px
     length_s = float(video.frame_count / video.rate)
     frames = f"{video.frame_count} frames of {width}×{height} px, {length_s:.1f} s"
     packing = f", read as {video.frame_packing.replace('_', ' ')}" if video.frame_packing else ""
-    return f"{OUTPUTS[film.output].label}: {frames}{packing}. {OUTPUTS[film.output].viewing}"
+    return f"{OUTPUTS[upload.output].label}: {frames}{packing}. {OUTPUTS[upload.output].viewing}"
 
 
 def _describe_problems(tally: "VideoTally") -> list[str]:
