@@ -119,5 +119,5 @@ def _carry_view(
         for grey, track in matched
     )
     disparity_px, confidence = np.empty(own.shape, np.float32), np.empty(own.shape, np.float32)
-    take_pixels(own, other, towards, before, after, np.float32(share), WEIGHTS, disparity_px, confidence)
+    take_pixels(own, other, towards, before, after, share, WEIGHTS, disparity_px, confidence)
     return disparity_px, confidence

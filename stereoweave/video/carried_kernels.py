@@ -54,7 +54,7 @@ def take_pixels(own, other, towards, before, after, share, weights, disparity_px
             later_column = min(max(int(round(x + after_to_px[i, j, 0])), 0), width - 1)
             from_px, to_px = before_disparity_px[row, column], after_disparity_px[later_row, later_column]
             certain, later = before_confidence[row, column], after_confidence[later_row, later_column]
-            part = share
+            part = np.float32(share)
             if abs(to_px - from_px) > SAME_PX + SAME_SHARE * abs(from_px):
                 # Four comparisons in one loop, which takes half the time of four loops.
                 place, later_place = x + towards * from_px, x + towards * to_px

@@ -112,6 +112,6 @@ def test_the_kernel_equals_its_plain_version(rng, shape, towards):
         for grey in greys
     ]
     found = np.full((2, *shape), np.nan, np.float32)
-    take_pixels(own, other, towards, *sources, np.float32(0.3), WEIGHTS, *found)
+    take_pixels(own, other, towards, *sources, 0.3, WEIGHTS, *found)
     expected = plain_take(own, other, towards, sources, 0.3, WEIGHTS)
     np.testing.assert_allclose(found, expected, atol=1e-4)
