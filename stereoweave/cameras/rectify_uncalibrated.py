@@ -30,7 +30,7 @@ _FIELD_PX = 6.0
 _FIELD_SHARE = 0.8
 _SOFT_PX = 0.5
 _MOST_TURN_DEGREES = 20.0
-# Cameras are taken for parallel up to this angle between them, whose fit is wrong by up to 0.1 degrees.
+# Cameras are taken for parallel up to this angle between them, which is fitted freely first.
 _MOST_TOE_IN_DEGREES = 0.5
 # Largest difference in focal length; a larger one is taken for a camera that moved forward.
 _MOST_SCALE = 0.07
