@@ -71,10 +71,6 @@ class _Sample(NamedTuple):
     alignment: Aligned
     notes: list[Note] | None
 
-    @property
-    def is_flat(self) -> bool:
-        return "same_picture" in self.alignment.alignment.defects
-
 
 def survey_video(
     video: StereoVideo, matcher: Matcher, bar: Progress, *, rectified: bool = True, threads: int | None = None
@@ -118,6 +114,9 @@ def _sample_frame(frame: StereoFrame, matcher: Matcher, *, rectified: bool, chec
     if not checked:
         pair, scale = _scale_down(pair)
     aligned = align(pair) if rectified else Aligned(pair=pair, alignment=check_pair(pair.left, pair.right))
+    if scale > 1 and _is_flat(aligned):
+        # At its own size, a shallow frame may differ from a flat one.
+        return _sample_frame(frame, matcher, rectified=rectified, checked=True)._replace(notes=None)
     estimate = match(matcher, aligned.pair)
     step = max(1, round(_SURVEY_STEP_PX / scale))
     sample = _Sample(
@@ -127,10 +126,15 @@ def _sample_frame(frame: StereoFrame, matcher: Matcher, *, rectified: bool, chec
         aligned,
         list(aligned.notes) if checked else None,
     )
-    if sample.notes is not None and not sample.is_flat:
+    if sample.notes is not None and not _is_flat(aligned):
         remedy = _REMEDY_OF_RECTIFIED if rectified else RECTIFY
         sample.notes.extend(find_problems(aligned.pair, estimate, aligned.alignment, remedy))
     return sample
+
+
+def _is_flat(aligned: Aligned) -> bool:
+    """Return whether both views of a frame are the same picture."""
+    return "same_picture" in aligned.alignment.defects
 
 
 def _scale_down(pair: StereoPair) -> tuple[StereoPair, float]:
@@ -145,7 +149,7 @@ def _scale_down(pair: StereoPair) -> tuple[StereoPair, float]:
 def _note_flat(samples: Sequence[_Sample]) -> list[Note]:
     """Return a list with a note on the flat frames, if there are any."""
     spans = []
-    for is_flat, run in groupby(samples, key=lambda sample: sample.is_flat):
+    for is_flat, run in groupby(samples, key=lambda sample: _is_flat(sample.alignment)):
         times = [format_time(sample.time) for sample in run]
         if is_flat:
             spans.append(times[0] if len(times) == 1 else f"{times[0]} to {times[-1]}")
