@@ -7,7 +7,7 @@ import numpy as np
 from stereoweave.system.jit import inlined, kernel
 from stereoweave.video.temporal_kernels import SAME_PX, SAME_SHARE
 
-RADIUS_PX = 3
+RADIUS_PX = 2
 """Greatest distance of a window's pixels from its centre, along rows and columns."""
 MOST_LEVELS = np.float32(40)
 """A pixel of a window counts at most this difference, because it may lie on another surface."""
