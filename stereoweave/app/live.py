@@ -17,6 +17,7 @@ from stereoweave.errors import Note
 from stereoweave.io.colormap import colour_disparity, find_colour_range_px
 from stereoweave.matching.estimate import match
 from stereoweave.matching.matcher import Matcher
+from stereoweave.outputs.metres import format_metres
 from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS, Frame, Picture, detect_layout
 from stereoweave.stereo import StereoCamera, StereoPair
 
@@ -144,8 +145,7 @@ def label_values(camera: StereoCamera | None, disparities_px: Sequence[float]) -
     """Return each disparity as a depth in metres, or in pixels if the camera is unknown."""
     if camera is None:
         return [f"{disparity_px:.1f} px" for disparity_px in disparities_px]
-    depths_m = camera.depth_m(np.array([disparities_px]))[0]
-    return [f"{depth_m:.2f} m" if np.isfinite(depth_m) else "infinite" for depth_m in depths_m]
+    return [format_metres(float(depth_m)) for depth_m in camera.depth_m(np.array([disparities_px]))[0]]
 
 
 def _draw_legend(camera: StereoCamera | None, range_px: tuple[float, float], width_px: int) -> Frame:

@@ -16,6 +16,7 @@ from stereoweave.io.colormap import colour_disparity, find_colour_range_px
 from stereoweave.matching.backend import Backend
 from stereoweave.matching.options import MatchOptions
 from stereoweave.outputs.measure import distance
+from stereoweave.outputs.metres import format_metres
 from stereoweave.outputs.point_cloud import EmptyError, make_point_cloud, write_glb
 from stereoweave.outputs.report import Summary
 from stereoweave.outputs.results import FILES, needs_camera, write_files
@@ -23,7 +24,7 @@ from stereoweave.outputs.run import Result, run
 from stereoweave.pictures.prepare import Prepared, Request, prepare
 from stereoweave.rendering.renderer import Renderer
 from stereoweave.rendering.scaling import fit_size, scale_down
-from stereoweave.stereo import Estimate, StereoCamera, StereoPair
+from stereoweave.stereo import Estimate, StereoCamera, StereoPair, assume_camera
 
 _LONGER_SIDE_PX = 1280
 _MOST_POINTS = 300_000
@@ -32,7 +33,8 @@ _MOST_POINTS = 300_000
 _FARTHEST = 4.0
 # Files up to this total size, reached at about 8 megapixels, are stored twice: individually and in the zip.
 _MOST_ZIPPED_BYTES = 300 * 1024**2
-_FARTHEST_SHOWN_M = 1000
+# Distance between human eyes.
+_EYES_M = 0.065
 # The files that everyone can open.
 _SHOWN_FIRST = ("report.html", "preview.png")
 _NO_METRES = "For metres, give a calibration file, or the focal length and the baseline."
@@ -220,7 +222,7 @@ def format_colour_range(session: Session) -> tuple[str, str]:
         far_px, near_px = ends_px[0] / session.scale
         return f"{far_px:.1f} px", f"{near_px:.1f} px"
     far_m, near_m = session.pair.camera.depth_m(ends_px)[0]
-    return _format_metres(far_m), _format_metres(near_m)
+    return format_metres(far_m), format_metres(near_m)
 
 
 def mark_clicks(
@@ -257,7 +259,9 @@ def format_summary(summary: Summary) -> list[str]:
     """Format a result's depth and confidence as one line, its size, time and disparity as another."""
     depth = "Depth without metres (they need a calibration)"
     if summary.depth_p1_m is not None:
-        depth = f"Depth from {summary.depth_p1_m:.2f} m, median {_format_metres(summary.depth_median_m)}"
+        depth = (
+            f"Depth from {format_metres(summary.depth_p1_m)}, median {format_metres(summary.depth_median_m)}"
+        )
     return [
         f"{depth}; confident in {summary.confident_percent:.0f} % of the picture",
         f"{summary.width_px}×{summary.height_px} px, matched in {summary.estimate_ms / 1000:.1f} s; "
@@ -266,35 +270,22 @@ def format_summary(summary: Summary) -> list[str]:
     ]
 
 
-def _format_metres(depth_m: float | None) -> str:
-    if depth_m is None or not np.isfinite(depth_m):
-        return "infinite"
-    # Beyond, a disparity's error of a hundredth of a pixel changes the depth by a multiple.
-    return f"{depth_m:.2f} m" if depth_m < _FARTHEST_SHOWN_M else f"over {_FARTHEST_SHOWN_M} m"
-
-
 def _describe_pixel(result: Result, point: tuple[int, int]) -> str:
     """Describe the disparity, depth and confidence at a pixel of the full-size left image."""
     column, row = point
     disparity_px = result.estimate.disparity_px[row : row + 1, column : column + 1]
     text = f"({column}, {row}): disparity {disparity_px[0, 0]:.2f} px"
     if result.pair.camera:
-        text += f", depth {_format_metres(float(result.pair.camera.depth_m(disparity_px)[0, 0]))}"
+        text += f", depth {format_metres(float(result.pair.camera.depth_m(disparity_px)[0, 0]))}"
     return f"{text}; confidence {100 * result.estimate.confidence[row, column]:.0f} %"
 
 
 def _assume_camera(estimate: Estimate) -> StereoCamera:
-    """Return a camera that gives a plausible point cloud.
+    """Return a camera that gives a plausible point cloud, as if the cameras were as far apart as eyes are.
 
-    It has a field of view of 53 degrees and a baseline of 65 mm, about the distance between human eyes.
     Negative disparities indicate converged cameras; points with the lowest disparities are then assumed to be
     infinitely far away.
     """
     height, width = estimate.disparity_px.shape
-    return StereoCamera(
-        focal_px=width,
-        baseline_m=0.065,
-        cx_px=(width - 1) / 2,
-        cy_px=(height - 1) / 2,
-        doffs_px=max(0.0, -float(np.percentile(estimate.disparity_px, 1))),
-    )
+    least_px = float(np.percentile(estimate.disparity_px, 1))
+    return assume_camera((width, height), baseline_m=_EYES_M, doffs_px=max(0.0, -least_px))

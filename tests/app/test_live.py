@@ -273,7 +273,7 @@ def test_the_legend_goes_from_the_far_colour_to_the_near_one():
 
 def test_with_a_known_camera_values_are_in_metres():
     camera = StereoCamera(focal_px=600, baseline_m=0.1, cx_px=320, cy_px=240)
-    assert label_values(camera, (6.0, 40.0, 0.0)) == ["10.00 m", "1.50 m", "infinite"]
+    assert label_values(camera, (6.0, 40.0, 0.0)) == ["10.0 m", "1.50 m", "infinity"]
     assert label_values(None, (6.0, 40.0)) == ["6.0 px", "40.0 px"]
 
 
