@@ -171,7 +171,7 @@ def video(  # noqa: PLR0913 - each is an option of the command line
         typer.echo(f"stereoweave: {out}: stopped; {state}", err=True)
         raise typer.Exit(130) from None
     _print_tally(out, tally)
-    if length_s is not None:
+    if length_s is not None and tally.frames_per_s:
         typer.echo(f"the whole video takes about {format_duration(whole_count / tally.frames_per_s)}")
 
 

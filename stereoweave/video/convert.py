@@ -3,6 +3,7 @@
 import hashlib
 import time
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import replace
 from fractions import Fraction
 from itertools import chain, islice
@@ -89,12 +90,13 @@ def convert_video(
             converter = FrameConverter(job, survey)
             for note in [*notes, *job.find_losses(survey)]:
                 _print_line(console, note.format(job.name_of))
-        meter = _Meter(bar, out.name, video, converter.tally.frames)
         frames = video.frames(converter.tally.frames)
-        for first in frames:
+        opening = list(islice(frames, 1))  # decodes all frames before it, which is no part of the speed
+        meter = _Meter(bar, out.name, video, converter.tally.frames)
+        for first in chain(opening, frames):
             part = islice(chain([first], frames), round(_PART_S * video.rate) or 1)
-            with parts.next(converter.state) as path:
-                recorder.write_part(path, map(meter.count, converter.convert(part)))
+            with parts.next(converter.state) as path, closing(converter.convert(part)) as pictures:
+                recorder.write_part(path, map(meter.count, pictures))
         recorder.join(parts.files, video.sound, out, job.describe_values(converter.survey))
     return replace(converter.tally, frames_per_s=meter.frames_per_s)
 

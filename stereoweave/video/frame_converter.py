@@ -1,6 +1,6 @@
 """Conversion of frames to output images, whose steps overlap in threads."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import TypeVar
@@ -14,7 +14,7 @@ from stereoweave.stereo import Estimate
 from stereoweave.system.ahead import ahead
 from stereoweave.system.threads import thread_count
 from stereoweave.video.carried_frames import EstimatedFrame, carry_depth
-from stereoweave.video.frame_groups import FrameGroup, FrameGrouper
+from stereoweave.video.frame_groups import MATCHED_EVERY, FrameGroup, FrameGrouper
 from stereoweave.video.job import VideoJob
 from stereoweave.video.reader import StereoFrame, format_time
 from stereoweave.video.shot_alignment import ShotAligner
@@ -23,8 +23,8 @@ from stereoweave.video.temporal_filter import TemporalFilter
 from stereoweave.video.writer import Picture
 
 _NAMED_PROBLEMS = 3
-# Steps that wait for each other need no more than this.
-_FRAMES_AHEAD, _GROUPS_AHEAD = 6, 1
+# Each step works on one group while the next one waits. More would only take memory.
+_GROUPS_AHEAD, _ESTIMATES_AHEAD, _PICTURES_AHEAD = 1, MATCHED_EVERY, 2
 
 Item = TypeVar("Item")
 
@@ -52,7 +52,7 @@ class VideoTally:
 
 
 def load_matcher(job: VideoJob) -> Matcher:
-    """Load a job's network for use beside other steps, which together take longer than the network."""
+    """Load a job's network, with one thread fewer, because decoding, rendering and encoding run beside it."""
     return replace(job.backend, threads=max(thread_count(job.backend.threads) - 1, 1)).matcher()
 
 
@@ -102,25 +102,24 @@ class FrameConverter:
             **self._grouper.state(),
         }
 
-    def convert(self, frames: Iterable[StereoFrame]) -> Iterator[tuple[Fraction, Picture]]:
+    def convert(self, frames: Iterable[StereoFrame]) -> Generator[tuple[Fraction, Picture]]:
         """Yield the time in seconds and the output image of each frame.
 
         All frames are consumed before the iterator ends, so that `state` is complete.
         """
         groups = self._overlap(self._grouper(frames), _GROUPS_AHEAD)
         matched = self._overlap(map(self._match, groups), _GROUPS_AHEAD)
-        estimated = self._overlap(carry_depth(matched, self._filter, self._threads), _FRAMES_AHEAD)
-        rendered = self._overlap(map(self._render, estimated), _FRAMES_AHEAD)
-        for frame, picture in rendered:
-            self.tally.add(frame)
-            yield frame.time, picture
+        estimated = self._overlap(carry_depth(matched, self._filter, self._threads), _ESTIMATES_AHEAD)
+        yield from self._overlap(map(self._render, estimated), _PICTURES_AHEAD)
         self.tally.cuts = self._filter.cuts
 
     def _match(self, group: FrameGroup) -> tuple[FrameGroup, Estimate]:
         return group, match(self._matcher, group.pairs[-1], self._options)
 
-    def _render(self, estimated: EstimatedFrame) -> tuple[StereoFrame, Picture]:
-        return estimated.frame, self._job.render_frame(estimated.pair, estimated.estimate, self.survey)
+    def _render(self, estimated: EstimatedFrame) -> tuple[Fraction, Picture]:
+        frame, pair, estimate = estimated
+        self.tally.add(frame)
+        return frame.time, self._job.render_frame(pair, estimate, self.survey)
 
     def _overlap(self, items: Iterable[Item], count: int) -> Iterator[Item]:
         """Compute items ahead of their use, if more than one thread is allowed."""

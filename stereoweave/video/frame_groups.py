@@ -31,12 +31,12 @@ class FrameGroup(NamedTuple):
 class FrameGrouper:
     """Grouper of a video's frames.
 
-    A group has a single frame at the start of the video, and up to `MATCHED_EVERY` frames in which a shot
-    begins are matched one by one, since depth is not carried across a cut.
+    The first frame is a group of its own. So is each of the next `MATCHED_EVERY` frames if a shot begins
+    among them, because depth is not carried across a cut.
 
     Args:
         aligner: Aligner of the frames; None to leave them as they are.
-        last_grey: Left image of the frame before, aligned, grey and at half size; None at the start.
+        last_grey: Left image of the last frame, as read, grey and at half size; None at the start.
     """
 
     def __init__(
@@ -48,10 +48,10 @@ class FrameGrouper:
         """Yield the frames in groups. The last frame ends a group, so that it is matched in any case."""
         iterator = iter(frames)
         while several := list(islice(iterator, 1 if self._last_grey is None else MATCHED_EVERY)):
-            last = self._align(several[-1])
-            if len(several) > 1 and not self._begins_shot(last):
-                yield FrameGroup(several, [*map(self._align, several[:-1]), last])
-                self._last_grey = _thumbnail(last)
+            grey = _make_thumbnail(several[-1])
+            if len(several) > 1 and not self._begins_shot(grey):
+                self._last_grey = grey
+                yield FrameGroup(several, [*map(self._align, several)])
                 continue
             for frame in several:
                 yield FrameGroup([frame], [self._begin(frame)])
@@ -67,16 +67,14 @@ class FrameGrouper:
         return cls(ShotAligner.from_state(state) if "aligner" in state else None, state.get("last_grey"))
 
     def _begin(self, frame: StereoFrame) -> StereoPair:
-        """Return a frame's aligned pair; if it begins a shot, its rows are measured first."""
-        pair = self._align(frame)
-        if self._aligner and self._last_grey is not None and self._begins_shot(pair):
+        """Return a frame's aligned pair; if the frame begins a shot, its rows are measured."""
+        grey = _make_thumbnail(frame)
+        if self._aligner and self._last_grey is not None and self._begins_shot(grey):
             self._aligner.begin_shot()
-            pair = self._align(frame)
-        self._last_grey = _thumbnail(pair)
-        return pair
+        self._last_grey = grey
+        return self._align(frame)
 
-    def _begins_shot(self, pair: StereoPair) -> bool:
-        grey = _thumbnail(pair)
+    def _begins_shot(self, grey: UInt8[np.ndarray, "h w"]) -> bool:
         if self._last_grey is None or self._last_grey.shape != grey.shape:
             return True
         return measure_motion(self._last_grey, grey).explained_share < CUT_SHARE
@@ -86,5 +84,5 @@ class FrameGrouper:
         return self._aligner(pair) if self._aligner else pair
 
 
-def _thumbnail(pair: StereoPair) -> UInt8[np.ndarray, "h w"]:
-    return halve(convert_to_grey(pair.left))
+def _make_thumbnail(frame: StereoFrame) -> UInt8[np.ndarray, "h w"]:
+    return halve(convert_to_grey(frame.left))

@@ -1,9 +1,11 @@
 """Survey of a video before its conversion: disparities and defects of frames from the whole video."""
 
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from fractions import Fraction
+from functools import partial
 from itertools import groupby, islice
 from typing import NamedTuple
 
@@ -61,14 +63,16 @@ class _Sample(NamedTuple):
         time: Time of the frame in seconds.
         disparities_px: Disparities of a grid of pixels [N, 1].
         middle_px: Median disparity.
-        alignment: The frame's alignment.
+        swapped: Whether left and right are swapped.
+        flat: Whether both views are the same picture.
         notes: Notes on the frame; None if it was not checked for problems.
     """
 
     time: Fraction
     disparities_px: np.ndarray
     middle_px: float
-    alignment: Aligned
+    swapped: bool
+    flat: bool
     notes: list[Note] | None
 
 
@@ -78,21 +82,15 @@ def survey_video(
     """Measure the disparities of frames spread over the whole video; return them, and notes on the video.
 
     The first frames alone are not enough, because they may be titles with a different disparity range. If
-    `rectified`, frames out of line are aligned first.
+    `rectified`, frames out of line are aligned first. Up to `threads` frames are measured at once.
     """
     picked = _spread_evenly(video.frame_count, _SURVEYED_FRAMES)
     checked = set(picked[len(picked) // 6 :: -(-len(picked) // _CHECKED_FRAMES)])
     shown = bar.add_task("surveying depth", total=len(picked), loss="", rate="")
-    frames = islice(video.frames(), picked.start, picked.stop, picked.step)
     samples = []
-    with ThreadPoolExecutor(thread_count(threads)) as pool:
-        for sample in pool.map(
-            lambda index, frame: _sample_frame(frame, matcher, rectified=rectified, checked=index in checked),
-            picked,
-            frames,
-        ):
-            samples.append(sample)
-            bar.advance(shown)
+    for sample in _sample_frames(video, matcher, (picked, checked), rectified=rectified, threads=threads):
+        samples.append(sample)
+        bar.advance(shown)
     defects = [
         [_add_time(sample.time, note, video) for note in sample.notes]
         for sample in samples
@@ -103,9 +101,37 @@ def survey_video(
         find_colour_range_px(all_px),
         float(np.median([sample.middle_px for sample in samples])),
         _find_match_range_px(all_px, matcher),
-        2 * sum(sample.alignment.swapped for sample in samples) > len(samples),
+        2 * sum(sample.swapped for sample in samples) > len(samples),
     )
     return survey, [*video.notes, *_note_flat(samples), *_select_common_notes(defects)]
+
+
+def _sample_frames(
+    video: StereoVideo,
+    matcher: Matcher,
+    chosen: tuple[range, set[int]],
+    *,
+    rectified: bool,
+    threads: int | None,
+) -> Iterator[_Sample]:
+    """Yield samples of the chosen frames; those in the second set are checked for problems."""
+    picked, checked = chosen
+    count = thread_count(threads)
+    frames = islice(video.frames(), picked.start, picked.stop, picked.step)
+    with ThreadPoolExecutor(count) as pool:
+        coming = deque[Future[_Sample]]()
+        try:
+            for index, frame in zip(picked, frames, strict=True):
+                # Frames wait in memory until they are measured, so only some are read ahead.
+                if len(coming) > count:
+                    yield coming.popleft().result()
+                work = partial(_sample_frame, rectified=rectified, checked=index in checked)
+                coming.append(pool.submit(work, frame, matcher))
+            while coming:
+                yield coming.popleft().result()
+        finally:
+            for future in coming:
+                future.cancel()
 
 
 def _sample_frame(frame: StereoFrame, matcher: Matcher, *, rectified: bool, checked: bool) -> _Sample:
@@ -123,10 +149,11 @@ def _sample_frame(frame: StereoFrame, matcher: Matcher, *, rectified: bool, chec
         frame.time,
         scale * estimate.disparity_px[::step, ::step].reshape(-1, 1),
         scale * median_disparity_px(estimate),
-        aligned,
+        aligned.swapped,
+        _is_flat(aligned),
         list(aligned.notes) if checked else None,
     )
-    if sample.notes is not None and not _is_flat(aligned):
+    if sample.notes is not None and not sample.flat:
         remedy = _REMEDY_OF_RECTIFIED if rectified else RECTIFY
         sample.notes.extend(find_problems(aligned.pair, estimate, aligned.alignment, remedy))
     return sample
@@ -149,7 +176,7 @@ def _scale_down(pair: StereoPair) -> tuple[StereoPair, float]:
 def _note_flat(samples: Sequence[_Sample]) -> list[Note]:
     """Return a list with a note on the flat frames, if there are any."""
     spans = []
-    for is_flat, run in groupby(samples, key=lambda sample: _is_flat(sample.alignment)):
+    for is_flat, run in groupby(samples, key=lambda sample: sample.flat):
         times = [format_time(sample.time) for sample in run]
         if is_flat:
             spans.append(times[0] if len(times) == 1 else f"{times[0]} to {times[-1]}")
