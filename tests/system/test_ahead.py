@@ -33,6 +33,21 @@ def test_no_more_items_than_asked_for_are_computed_ahead():
     assert 1 <= len(computed) <= 3
 
 
+def test_closing_ends_the_items_too():
+    ended = []
+
+    def items():
+        try:
+            yield from range(9)
+        finally:
+            ended.append(True)
+
+    found = ahead(ahead(items(), 1), 1)
+    next(found)
+    found.close()
+    assert ended == [True]
+
+
 def test_an_error_is_raised_at_the_place_of_its_item():
     def items():
         yield 1

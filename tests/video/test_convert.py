@@ -16,6 +16,7 @@ from other_processes import halted
 from video_examples import TEXTURED, damage, example_pairs, packets, write_side_by_side, write_video
 
 from stereoweave.cli.root import main
+from stereoweave.errors import StereoweaveError
 from stereoweave.io.colormap import colour_disparity
 from stereoweave.io.images import read_image, write_image
 from stereoweave.learn.data.collage import paint_collage
@@ -89,6 +90,29 @@ def test_depth_in_16_bits_is_disparity_times_256(tmp_path):
         grey = next(container.decode(video=0)).to_ndarray()
     # The first frame has no predecessor, so the temporal filter leaves it unchanged.
     np.testing.assert_array_equal(grey, np.rint(256 * estimate_of(first).disparity_px))
+
+
+def test_steps_that_overlap_give_the_same_frames(tmp_path):
+    video = write_side_by_side(tmp_path / "in.mp4", example_pairs(9), codec="libx264")
+    for threads in ("1", "2"):
+        assert run(video, tmp_path / f"{threads}.mkv", "--depth16", "--threads", threads) == 0
+    # With two threads, too, the network has one.
+    one, two = (frames_of(tmp_path / f"{threads}.mkv") for threads in ("1", "2"))
+    assert len(one) == 9
+    np.testing.assert_array_equal(one, two)
+
+
+def test_an_error_of_a_step_in_a_thread_ends_the_conversion(tmp_path, monkeypatch, capsys):
+    video = write_side_by_side(tmp_path / "in.mp4", example_pairs(6), codec="libx264")
+
+    def fail(*_):
+        raise StereoweaveError("expected a network that works, found none")
+
+    monkeypatch.setattr("stereoweave.video.frame_converter.match", fail)
+    assert run(video, tmp_path / "out.mp4", "--depth", "--threads", "2") == 2
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last == "stereoweave: expected a network that works, found none"
+    assert [path.name for path in tmp_path.iterdir()] == ["in.mp4"]
 
 
 def test_depth_colours_mean_the_same_throughout_a_video(tmp_path, capsys):
@@ -183,7 +207,9 @@ def interrupt(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(StereoVideo, "frames", frames)
 
 
-@pytest.mark.parametrize("words", [("--position", "0.4"), ("--layout", "rgbd")])
+@pytest.mark.parametrize(
+    "words", [("--position", "0.4"), ("--layout", "rgbd"), ("--depth", "--threads", "2")]
+)
 def test_an_interrupted_conversion_resumes_with_the_same_frames(tmp_path, monkeypatch, capsys, words):
     video = slow_video(tmp_path / "in.mp4")
     assert run(video, tmp_path / "whole.mp4", *words) == 0
