@@ -98,12 +98,15 @@ class Layout:
         converged: Whether views are overlaid or compared in place, so the middle of the scene should have no
             parallax.
         mark: File name suffix by which viewers detect the layout.
+        squeezed: For a layout of views at half width or height: the layout that gives its image from a pair
+            that is halved already (`halve`), and the axis of the halving.
     """
 
     compose: Callable[[Renderer, LayoutOptions], np.ndarray]
     positions: tuple[float, ...] = (0.0, 1.0)
     converged: bool = False
     mark: str = ""
+    squeezed: tuple[str, int] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,7 +145,7 @@ def side_by_side_half(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.nd
 
     If the width is odd, the last column is repeated.
     """
-    return np.hstack([_halve(eye, axis=1) for eye in _render_eyes(renderer)])
+    return np.hstack([halve(eye, axis=1) for eye in _render_eyes(renderer)])
 
 
 def crossed(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
@@ -160,7 +163,7 @@ def top_bottom_half(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndar
 
     If the height is odd, the last row is repeated.
     """
-    return np.vstack([_halve(eye, axis=0) for eye in _render_eyes(renderer)])
+    return np.vstack([halve(eye, axis=0) for eye in _render_eyes(renderer)])
 
 
 def make_anaglyph(kind: str) -> Callable[[Renderer, LayoutOptions], np.ndarray]:
@@ -219,10 +222,10 @@ def _swing_positions(count: int) -> tuple[float, ...]:
 # widely used conversion tool; the mark of a quilt follows Looking Glass.
 LAYOUTS: dict[str, Layout] = {
     "side_by_side": Layout(compose=side_by_side, mark="_LRF_Full_SBS"),
-    "side_by_side_half": Layout(compose=side_by_side_half, mark="_half_LR"),
+    "side_by_side_half": Layout(compose=side_by_side_half, mark="_half_LR", squeezed=("side_by_side", 1)),
     "crossed": Layout(compose=crossed, mark="_RLF_cross"),
     "top_bottom": Layout(compose=top_bottom, mark="_TBF_fulltb"),
-    "top_bottom_half": Layout(compose=top_bottom_half, mark="_half_TB"),
+    "top_bottom_half": Layout(compose=top_bottom_half, mark="_half_TB", squeezed=("top_bottom", 0)),
     "anaglyph_grey": Layout(compose=make_anaglyph("grey"), converged=True),
     "anaglyph_colour": Layout(compose=make_anaglyph("colour"), converged=True),
     "anaglyph_half_colour": Layout(compose=make_anaglyph("half_colour"), converged=True),
@@ -336,7 +339,7 @@ def _render_eyes(renderer: Renderer) -> list[UInt8[np.ndarray, "h w 3"]]:
     return list(render_views(renderer, (0.0, 1.0)))
 
 
-def _halve(eye: UInt8[np.ndarray, "h w 3"], axis: int) -> UInt8[np.ndarray, "h2 w2 3"]:
+def halve(eye: UInt8[np.ndarray, "h w 3"], axis: int) -> UInt8[np.ndarray, "h2 w2 3"]:
     """Halve an image along an axis by averaging neighbouring pixels.
 
     If the side along this axis is odd, the last row or column is repeated.

@@ -80,14 +80,14 @@ def convert_video(
         progress(console) as bar,
     ):
         if parts.files:
-            converter = FrameConverter.from_state(job, parts.state())
+            converter = FrameConverter.from_state(job, parts.state(), video.size_px)
             done_s = converter.tally.frames / video.rate
             _print_line(console, f"{out.name}: resuming at {format_time(Fraction(round(done_s)))[:-4]}")
         else:
             survey, notes = survey_video(
                 video, matcher, bar, rectified=job.rectify, threads=job.backend.threads
             )
-            converter = FrameConverter(job, survey)
+            converter = FrameConverter(job, survey, video.size_px)
             for note in [*notes, *job.find_losses(survey)]:
                 _print_line(console, note.format(job.name_of))
         frames = video.frames(converter.tally.frames)

@@ -18,6 +18,7 @@ from stereoweave.video.frame_groups import MATCHED_EVERY, FrameGroup, FrameGroup
 from stereoweave.video.job import VideoJob
 from stereoweave.video.reader import StereoFrame, format_time
 from stereoweave.video.shot_alignment import ShotAligner
+from stereoweave.video.squeezing import squeeze_job
 from stereoweave.video.survey import Survey
 from stereoweave.video.temporal_filter import TemporalFilter
 from stereoweave.video.writer import Picture
@@ -62,27 +63,32 @@ class FrameConverter:
     Args:
         job: Settings of the conversion.
         survey: Disparities of the whole video.
+        size_px: Width and height of the frames of one eye.
 
     Attributes:
         tally: Counts so far.
     """
 
-    def __init__(self, job: VideoJob, survey: Survey) -> None:
+    def __init__(self, job: VideoJob, survey: Survey, size_px: tuple[int, int]) -> None:
         self.survey, self.tally = survey, VideoTally()
-        self._job, self._options = job, MatchOptions(range_px=survey.match_range_px)
+        self._squeezed = squeeze_job(job, size_px)
+        self._seen = self._squeezed.squeeze_survey(survey)
+        self._options = MatchOptions(range_px=self._seen.match_range_px)
         self._threads = thread_count(job.backend.threads)
         self._matcher = load_matcher(job)
         self._filter = TemporalFilter(job.backend.threads)
         self._grouper = FrameGrouper(ShotAligner(swapped=survey.swapped) if job.rectify else None)
 
     @classmethod
-    def from_state(cls, job: VideoJob, state: dict[str, np.ndarray]) -> "FrameConverter":
+    def from_state(
+        cls, job: VideoJob, state: dict[str, np.ndarray], size_px: tuple[int, int]
+    ) -> "FrameConverter":
         """Restore a converter from a saved `state`; its output is the same as without an interruption."""
         low_px, high_px, middle_px, *match_range_px = state.pop("survey_px").tolist()
         survey = Survey(
             (low_px, high_px), middle_px, (match_range_px[0], match_range_px[1]) if match_range_px else None
         )
-        converter = cls(job, survey)
+        converter = cls(job, survey, size_px)
         frames, cuts, problems = state.pop("tally").tolist()
         converter.tally = VideoTally(frames, cuts, problems, state.pop("named").tolist())
         converter._filter = TemporalFilter.from_state(state, job.backend.threads)
@@ -107,7 +113,7 @@ class FrameConverter:
 
         All frames are consumed before the iterator ends, so that `state` is complete.
         """
-        groups = self._overlap(self._grouper(frames), _GROUPS_AHEAD)
+        groups = self._overlap(map(self._squeezed.squeeze, self._grouper(frames)), _GROUPS_AHEAD)
         matched = self._overlap(map(self._match, groups), _GROUPS_AHEAD)
         estimated = self._overlap(carry_depth(matched, self._filter, self._threads), _ESTIMATES_AHEAD)
         yield from self._overlap(map(self._render, estimated), _PICTURES_AHEAD)
@@ -119,7 +125,7 @@ class FrameConverter:
     def _render(self, estimated: EstimatedFrame) -> tuple[Fraction, Picture]:
         frame, pair, estimate = estimated
         self.tally.add(frame)
-        return frame.time, self._job.render_frame(pair, estimate, self.survey)
+        return frame.time, self._squeezed.job.render_frame(pair, estimate, self._seen)
 
     def _overlap(self, items: Iterable[Item], count: int) -> Iterator[Item]:
         """Compute items ahead of their use, if more than one thread is allowed."""

@@ -8,6 +8,8 @@ from jaxtyping import Bool, Float, UInt8
 
 # In pixels at half size, where noise is half as strong and optical flow takes a quarter of the time.
 _WINDOW_PX = 5
+# OpenCV's optical flow crashes if a wide image has fewer rows than this.
+_LEAST_SIDE_PX = 32
 # A window is explained if its mean difference is at most this multiple of the median difference, which
 # measures the image noise, plus an offset for clean images. The third number is the highest noise assumed.
 _EXPLAINED, _LEAST_LEVELS, _NOISIEST_LEVELS = 1.5, 0.5, 6.0
@@ -95,8 +97,14 @@ def measure_motion(before: UInt8[np.ndarray, "h2 w2"], grey: UInt8[np.ndarray, "
 
 def _find_flow(before: UInt8[np.ndarray, "h2 w2"], grey: UInt8[np.ndarray, "h2 w2"]) -> _Flow:
     """Find the flow from a grey image back to another one of the same brightness."""
-    rest = np.zeros((*grey.shape, 2), np.float32)
-    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST).calc(grey, before, rest)
+    height, width = grey.shape
+    more = max(0, _LEAST_SIDE_PX - height), max(0, _LEAST_SIDE_PX - width)
+    seen, shown = (
+        cv2.copyMakeBorder(image, 0, more[0], 0, more[1], cv2.BORDER_REPLICATE) for image in (grey, before)
+    )
+    rest = np.zeros((*seen.shape, 2), np.float32)
+    method = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
+    flow = np.ascontiguousarray(method.calc(seen, shown, rest)[:height, :width])
     moved_levels = _measure_difference_levels(grey, _warp(before, flow))
     rest_levels = _measure_difference_levels(grey, before)
     rests = rest_levels <= _REST * moved_levels + _REST_LEVELS

@@ -21,7 +21,7 @@ from stereoweave.io.colormap import colour_disparity
 from stereoweave.io.images import read_image, write_image
 from stereoweave.learn.data.collage import paint_collage
 from stereoweave.matching.matcher import Matcher
-from stereoweave.rendering.layouts import LAYOUTS, LayoutOptions
+from stereoweave.rendering.layouts import LAYOUTS, LayoutOptions, halve
 from stereoweave.rendering.renderer import Renderer
 from stereoweave.stereo import StereoPair
 from stereoweave.video.reader import StereoFrame, StereoVideo, open_video
@@ -142,6 +142,21 @@ def test_a_layout_equals_that_of_a_still_and_marks_the_file_name(tmp_path, name)
     made = tmp_path / f"out{LAYOUTS[name].mark}.mp4"
     assert np.abs(rgb_of(made)[0].astype(int) - still).mean() < 6
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(["in.mp4", made.name])
+
+
+@pytest.mark.parametrize(("name", "axis"), [("side_by_side_half", 1), ("top_bottom_half", 0)])
+def test_a_layout_of_half_size_equals_the_full_one_halved(tmp_path, name, axis):
+    video = write_side_by_side(tmp_path / "in.mp4", example_pairs(2), codec="libx264")
+    full = name.removesuffix("_half")
+    for layout in (full, name):
+        words = ["--layout", layout, "--strength", "1.5", "--convergence", "12"]
+        assert run(video, tmp_path / f"{layout}.mp4", *words) == 0
+    whole, half = (
+        rgb_of(next(tmp_path.glob(f"{layout}{LAYOUTS[layout].mark}.mp4")))[0] for layout in (full, name)
+    )
+    eyes = [halve(eye, axis) for eye in np.split(whole, 2, axis)]
+    assert half.shape == np.concatenate(eyes, axis).shape
+    assert np.abs(half.astype(int) - np.concatenate(eyes, axis)).mean() < 3
 
 
 def test_overlaid_views_converge_at_the_median_disparity_of_the_video(tmp_path):

@@ -327,6 +327,14 @@ def test_odd_image_sizes_are_filtered(rng, height, width):
     assert np.abs(found[-1] - 10).mean() < 0.6 * np.abs(maps_px - 10).mean()
 
 
+def test_low_and_wide_frames_are_filtered(rng):
+    height, width = 40, 200
+    left, right = texture(rng, height, width), texture(rng, height, width)
+    maps_px = 10 + rng.normal(0, 0.2, (6, height, width))
+    found = disparities(filter_all([(left, right, estimate(each)) for each in maps_px])[0])
+    assert np.abs(found[-1] - 10).mean() < 0.6 * np.abs(maps_px - 10).mean()
+
+
 def test_an_estimate_of_another_size_is_refused(rng, without_shape_checks):
     expected = "estimate: expected the same size as both images, found .90, 91."
     with pytest.raises(StereoweaveError, match=expected):
