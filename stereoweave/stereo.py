@@ -181,6 +181,9 @@ class Estimate:
     def __post_init__(self) -> None:
         if self.pair is not None:
             check_kind("pair", self.pair, StereoPair)
+        check_kind("notes", self.notes, tuple)
+        for note in self.notes:
+            check_kind("notes", note, Note)
         check_array("disparity_px", self.disparity_px, "f", 2)
         shape = self.disparity_px.shape
         for name in ("disparity_px", "right_disparity_px", "confidence", "occluded"):

@@ -110,7 +110,7 @@ def calls() -> list[Call]:
         Call("StereoCamera.depth_m", CAMERA.depth_m, disparity_px=FLAT),
         Call("StereoCamera.disparity_px", CAMERA.disparity_px, depth_m=FLAT),
         Call("StereoPair", sw.StereoPair, **pair, camera=CAMERA, left_seen=seen, right_seen=seen),
-        Call("Estimate", sw.Estimate, **maps, pair=PAIR),
+        Call("Estimate", sw.Estimate, **maps, pair=PAIR, notes=()),
         Call("DepthCurve", sw.DepthCurve, exponent=1.5, max_disparity_px=192.0),
         Call("DepthCurve of depth", sw.DepthCurve, max_depth_m=10.0),
         Call("StereoMatcher", sw.StereoMatcher, **sgbm, min_confidence=0.5, refined=False, **how),

@@ -66,7 +66,7 @@ def _flatten(values: Sequence[Any], kinds: list[str], words: Words) -> None:
         else:
             kind = "int" if isinstance(value, np.int64) else "float" if isinstance(value, float) else None
             kinds.append(kind or type(value).__name__)
-            words.append(value)
+            words.append(value.item() if isinstance(value, np.generic) else value)
 
 
 @functools.cache

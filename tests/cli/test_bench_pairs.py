@@ -83,7 +83,7 @@ def test_every_matcher_has_every_number_and_both_plots_are_written(sets, tmp_pat
 @pytest.mark.parametrize(
     ("options", "fragments"),
     [
-        ("--plot time.words", ["time.words: expected a picture file extension", "'.words'"]),
+        ("--plot time.words", ["time.words: expected a picture file extension", "found .words"]),
         ("--sparsification words", ["words: expected a picture file extension"]),
         ("--dataset words", ["dataset: expected one of", "'words'"]),
         ("--dataset kitti2015", ["expected a dataset folder"]),

@@ -50,8 +50,8 @@ MISTAKES = {
     # Pictures.
     "depth my photo.png right.png": "expected two pictures, left and right, or one that holds both views, "
     "found 3: my photo.png right.png; put quotes around a name with spaces: 'my photo.png'",
-    "depth film.mp4": "film.mp4: expected a picture (PNG, JPEG, TIFF or the like), found a video; use "
-    "'stereoweave video'",
+    "depth film.mp4": "film.mp4: expected a picture (PNG, JPEG, TIFF or the like), found a video; convert it "
+    "as such (stereoweave video)",
     "depth photo.heic photo.heic": "photo.heic: expected a picture (PNG, JPEG, TIFF or the like), found "
     "HEIC, the format of spatial photographs, which is unsupported; export it as two JPEG files, or as one "
     "JPEG file with both views side by side",

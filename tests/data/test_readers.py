@@ -51,10 +51,10 @@ def test_scenes_come_by_name_and_other_folders_are_passed_over(scene):
     assert [read.name for read in read_scenes(scene.parent)] == ["adirondack", "motorcycle", "pipes"]
 
 
-@pytest.mark.parametrize("folder", [".", "nowhere"])
-def test_a_folder_without_scenes_is_an_error_at_once(tmp_path, folder):
+@pytest.mark.parametrize(("folder", "found"), [(".", "neither"), ("nowhere", "no such folder")])
+def test_a_folder_without_scenes_is_an_error_at_once(tmp_path, folder, found):
     with pytest.raises(
-        StereoweaveError, match="expected <scene>/left.png below it, or rendered sets, found neither"
+        StereoweaveError, match=f"expected <scene>/left.png below it, or rendered sets, found {found}"
     ):
         read_scenes(tmp_path / folder)
 

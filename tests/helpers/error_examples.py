@@ -20,7 +20,7 @@ LAYOUTS = (
 
 def write_error_examples(folder: Path) -> None:
     """Write a pair, the same pair with the right picture 2 px lower, converging cameras or a zoomed
-    right picture, plain pictures, and a calibration.
+    right picture, plain pictures, and two calibrations.
     """
     for name in ("left.png", "right.png"):
         shutil.copy(TEXTURED / name, folder)
@@ -37,3 +37,4 @@ def write_error_examples(folder: Path) -> None:
     write_image(folder / "both.png", np.hstack([left, right]))
     write_image(folder / "plain.png", np.full((480, 640, 3), 90, np.uint8))
     write_rig(folder / "turned.yml", rig_of(pinhole))
+    shutil.copy(Path(__file__).parents[2] / "examples" / "calib.txt", folder)

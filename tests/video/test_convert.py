@@ -10,6 +10,7 @@ from fractions import Fraction
 from pathlib import Path
 
 import av
+import cv2
 import numpy as np
 import pytest
 from other_processes import halted
@@ -203,6 +204,16 @@ def test_depth_in_16_bits_warns_of_disparities_outside_its_range(tmp_path, capsy
     [line] = [line for line in capsys.readouterr().err.splitlines() if "16-bit" in line]
     assert line.startswith("16-bit grey covers 0 to 255.99 px; this video's disparities range from -2")
     assert line.endswith("are clipped; show all of them in colours (--depth)")
+
+
+def test_frames_that_could_not_be_rectified_ask_for_a_calibration(tmp_path, capsys):
+    left, right = (read_image(TEXTURED / f"{eye}.png") for eye in ("left", "right"))
+    size = right.shape[1::-1]
+    larger = cv2.warpAffine(right, cv2.getRotationMatrix2D((size[0] / 2, size[1] / 2), 0, 1.12), size)
+    video = write_side_by_side(tmp_path / "in.mp4", [(left, larger)] * 2, codec="libx264")
+    assert run(video, tmp_path / "out.mp4", "--depth", "--format", "side_by_side") == 0
+    told = capsys.readouterr().err
+    assert "larger than the left one; rectify the frames by a calibration first" in told
 
 
 def _red_from_green(anaglyph: np.ndarray) -> float:
