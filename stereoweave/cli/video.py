@@ -162,13 +162,7 @@ def video(  # noqa: PLR0913 - each is an option of the command line
         make_parent_folder(out)
         tally = convert_video(source, videos, out, job, Console(stderr=True))
     except KeyboardInterrupt:
-        folder = parts_folder(out)
-        state = (
-            f"finished parts are in {folder}; rerun the same command to resume"
-            if folder.exists()
-            else "no part was finished"
-        )
-        typer.echo(f"stereoweave: {out}: stopped; {state}", err=True)
+        _print_stopped(out, parts_folder(out))
         raise typer.Exit(130) from None
     _print_tally(out, tally)
     if length_s is not None and tally.frames_per_s:
@@ -216,6 +210,13 @@ def _add_mark(out: Path, layout: str, size_px: tuple[int, int]) -> Path:
 
     blank = np.broadcast_to(np.uint8(0), (*reversed(size_px), 3))
     return add_mark(out, layout, StereoPair(left=blank, right=blank), LayoutOptions())
+
+
+def _print_stopped(out: Path, folder: Path) -> None:
+    state = "no part was finished"
+    if folder.exists():
+        state = f"finished parts are in {folder}; rerun the same command to resume"
+    typer.echo(f"stereoweave: {out}: stopped; {state}", err=True)
 
 
 def _print_tally(out: Path, tally: "VideoTally") -> None:

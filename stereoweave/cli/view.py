@@ -23,7 +23,7 @@ from stereoweave.cli.options import (
     parse_largest_size_px,
     parse_range_px,
 )
-from stereoweave.errors import StereoweaveError
+from stereoweave.errors import Note, StereoweaveError
 
 if TYPE_CHECKING:
     from stereoweave.rendering.layouts import LayoutOptions
@@ -118,10 +118,7 @@ def view(  # noqa: PLR0913 - each is an option of the command line
     threads: Threads = None,
     provider: Provider = "cpu",
 ) -> None:
-    """Render a new view of a stereo pair, or a layout of several.
-
-    Layouts are for 3-D viewers and displays.
-    """
+    """Render a new view of a stereo pair, or a layout of several for 3-D viewers and displays."""
     from stereoweave.cameras.diagnosis import find_problems
     from stereoweave.cameras.rectify import crop as crop_to_content
     from stereoweave.matching.backend import Backend
@@ -158,8 +155,11 @@ def view(  # noqa: PLR0913 - each is an option of the command line
     estimate = match(Backend(model=model, threads=threads, provider=provider).matcher(), pair, options)
     written = file.write(pair, estimate, prepared.pictures)
     typer.echo(f"{file.path}: {written.description}")
-    problems = find_problems(pair, estimate, prepared.alignment, prepared.remedy)
-    for note in (*prepared.notes, *problems):
+    _print_notes([*prepared.notes, *find_problems(pair, estimate, prepared.alignment, prepared.remedy)])
+
+
+def _print_notes(notes: Sequence[Note]) -> None:
+    for note in notes:
         typer.echo(note.format(running_options()))
 
 
