@@ -62,7 +62,7 @@ def make_handheld_pairs(real: Path, step: int = 1) -> Iterator[HandheldPair]:
 
     Args:
         real: Folder of real pairs.
-        step: Only every so many pairs are made; each of them is the same for any step.
+        step: Distance between the pairs that are made; a pair is the same for any step.
     """
     scenes = list_scenes(real)
     for index, original in render_originals(step):
@@ -113,7 +113,7 @@ def take_with(
 
 
 def render_originals(step: int = 1) -> Iterator[tuple[int, Original]]:
-    """Yield the numbers and the originals of every so many rendered pairs."""
+    """Yield the numbers and the originals of the rendered pairs at this distance from each other."""
     from stereoweave.synth.sets.pair_rendering import RenderSpec, render_pair
     from stereoweave.synth.sets.renderers import shared_renderer
 

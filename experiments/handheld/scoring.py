@@ -16,7 +16,7 @@ from stereoweave.cameras.rectify_uncalibrated import fit_warps
 from stereoweave.errors import StereoweaveError
 
 _LOST_STEP_PX = 4
-# Every so many pairs are distorted further, and swapped.
+# One pair in this many is distorted further, and swapped.
 _PAIR_STEP = 10
 
 
