@@ -118,7 +118,7 @@ NOTES = {
     "depth inwards_left.png inwards_right.png --focal-px 640 --baseline-m 0.1 --rectify --model small "
     "-o out": "no depth in metres: rectification from feature matches did not find the cameras parallel; "
     "give a calibration (--calib)",
-    "view left.png zoomed.png --calib calib.txt --model small -o out.png": "the right picture is 12.0 % "
+    "view left.png zoomed.png --calib rectified.txt --model small -o out.png": "the right picture is 12.0 % "
     "larger than the left one; give a calibration of these cameras (--calib)",
     "view left.png zoomed.png --model small -o out.png": "the right picture is 12.0 % larger than the left "
     "one; give a calibration (--calib)",

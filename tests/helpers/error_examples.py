@@ -37,4 +37,4 @@ def write_error_examples(folder: Path) -> None:
     write_image(folder / "both.png", np.hstack([left, right]))
     write_image(folder / "plain.png", np.full((480, 640, 3), 90, np.uint8))
     write_rig(folder / "turned.yml", rig_of(pinhole))
-    shutil.copy(Path(__file__).parents[2] / "examples" / "calib.txt", folder)
+    shutil.copy(Path(__file__).parents[2] / "examples" / "calib.txt", folder / "rectified.txt")
