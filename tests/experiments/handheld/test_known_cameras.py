@@ -1,23 +1,8 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from experiments.handheld.known_cameras import draw_pair, score_pair, summarize_known_cameras
-from experiments.handheld.pairs import Original
-from stereoweave.learn.data.collage import paint_collage
-from stereoweave.stereo import StereoPair
-
-
-@pytest.fixture(scope="module")
-def original():
-    painted = paint_collage(77, 0, 2, 480, 640)
-    return Original(
-        name="collage",
-        pair=StereoPair(left=painted.left, right=painted.right),
-        truth_px=painted.disparity_px,
-        focal_px=640.0,
-    )
 
 
 def test_distances_of_a_known_camera_are_right_and_rows_as_close_as_without(original):
