@@ -99,7 +99,7 @@ class Layout:
             parallax.
         mark: File name suffix by which viewers detect the layout.
         squeezed: For a layout of views at half width or height: the layout that gives its image from a pair
-            that is halved already (`halve`), and the axis of the halving.
+            that is squeezed already (`squeeze`), and the axis of the squeezing.
     """
 
     compose: Callable[[Renderer, LayoutOptions], np.ndarray]
@@ -145,7 +145,7 @@ def side_by_side_half(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.nd
 
     If the width is odd, the last column is repeated.
     """
-    return np.hstack([halve(eye, axis=1) for eye in _render_eyes(renderer)])
+    return np.hstack([squeeze(eye, axis=1) for eye in _render_eyes(renderer)])
 
 
 def crossed(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
@@ -163,7 +163,7 @@ def top_bottom_half(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndar
 
     If the height is odd, the last row is repeated.
     """
-    return np.vstack([halve(eye, axis=0) for eye in _render_eyes(renderer)])
+    return np.vstack([squeeze(eye, axis=0) for eye in _render_eyes(renderer)])
 
 
 def make_anaglyph(kind: str) -> Callable[[Renderer, LayoutOptions], np.ndarray]:
@@ -339,8 +339,8 @@ def _render_eyes(renderer: Renderer) -> list[UInt8[np.ndarray, "h w 3"]]:
     return list(render_views(renderer, (0.0, 1.0)))
 
 
-def halve(eye: UInt8[np.ndarray, "h w 3"], axis: int) -> UInt8[np.ndarray, "h2 w2 3"]:
-    """Halve an image along an axis by averaging neighbouring pixels.
+def squeeze(eye: UInt8[np.ndarray, "h w 3"], axis: int) -> UInt8[np.ndarray, "h2 w2 3"]:
+    """Squeeze an image to half its size along an axis by averaging neighbouring pixels.
 
     If the side along this axis is odd, the last row or column is repeated.
     """

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from stereoweave.io.images import SMALLEST_SIDE_PX
-from stereoweave.rendering.layouts import LAYOUTS, halve
+from stereoweave.rendering.layouts import LAYOUTS, squeeze
 from stereoweave.stereo import StereoPair
 from stereoweave.video.frame_groups import FrameGroup
 from stereoweave.video.job import VideoJob
@@ -35,7 +35,7 @@ class SqueezedJob(NamedTuple):
         if self.axis is None:
             return group
         pairs = [
-            StereoPair(left=halve(pair.left, self.axis), right=halve(pair.right, self.axis))
+            StereoPair(left=squeeze(pair.left, self.axis), right=squeeze(pair.right, self.axis))
             for pair in group.pairs
         ]
         return group._replace(pairs=pairs)
