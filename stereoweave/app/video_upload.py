@@ -109,14 +109,14 @@ def convert_upload(upload: VideoUpload, folder: Path, report: Callable[[float, s
     whole_count = video.frame_count
     if upload.start_s is not None:
         video = video.excerpt(upload.start_s, PREVIEW_S)
-    video.on_frame = shown = _FrameReport(video.frame_count, report)
+    video.on_frame = _FrameReport(video.frame_count, report)
     job = VideoJob(**OUTPUTS[upload.output].settings, backend=upload.backend, name_of=upload.name_of)
     console = _NoteConsole()
     out = _name_file(upload, video, folder)
     tally = convert_video(video, upload.files, out, job, console)
     summary = _describe(upload, video)
     if upload.start_s is not None:
-        whole_s = shown.spent_s / video.frame_count * whole_count
+        whole_s = whole_count / tally.frames_per_s
         summary += f" A preview has no sound. The whole video takes about {format_duration(whole_s)}."
     return ConvertedVideo(out, summary, [*console.lines, *_describe_problems(tally)])
 
@@ -182,15 +182,11 @@ class _FrameReport:
         if self._passes == 1:
             self._report(_SURVEY_SHARE * share, "looking through the video")
             return
-        left = number and f", about {format_duration(self.spent_s / number * (self._count - number))} left"
+        spent_s = time.monotonic() - self._begin_s
+        left = number and f", about {format_duration(spent_s / number * (self._count - number))} left"
         self._report(
             _SURVEY_SHARE + (1 - _SURVEY_SHARE) * share, f"frame {number + 1} of {self._count}{left or ''}"
         )
-
-    @property
-    def spent_s(self) -> float:
-        """The time since the conversion began."""
-        return time.monotonic() - self._begin_s
 
 
 class _NoteConsole(Console):

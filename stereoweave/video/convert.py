@@ -127,7 +127,7 @@ def _print_line(console: Console, line: str) -> None:
 def _check_output(out: Path, job: VideoJob, video: StereoVideo, sources: Sequence[Path]) -> None:
     if job.depth16 and out.suffix.lower() != ".mkv":
         raise StereoweaveError(
-            f"{out}: expected the file extension .mkv for 16-bit depth, found {out.suffix!r}"
+            f"{out}: expected the file extension .mkv for 16-bit depth, found {out.suffix or 'none'}"
         )
     for source in sources:
         if source.exists() and out.exists() and out.samefile(source):

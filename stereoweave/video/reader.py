@@ -94,12 +94,16 @@ class StereoVideo:
     def frames(self, start: int = 0) -> Iterator[StereoFrame]:
         """Yield the frames from number `start` on, the same as if reading had begun at the first frame.
 
+        An excerpt is decoded from the last key frame before it.
+
         A frame that cannot be decoded is replaced by the last decoded frame. The frames that depend on the
         missing frame, up to the next key frame, are yielded as decoded. In both cases, the frame's `problem`
         says so.
         """
         steps, first = self._tracks[0].steps, self._first
-        every_track = zip(*(_bridge_gaps(track, first + start) for track in self._tracks), strict=False)
+        every_track = zip(
+            *(_bridge_gaps(track, first + start, first) for track in self._tracks), strict=False
+        )
         for index, seen in zip(range(first + start, first + self.frame_count), every_track, strict=False):
             pictures = [shot.picture() for shot, _ in seen]
             left, right = self._split.eyes(*pictures) if self._split else pictures
@@ -185,10 +189,13 @@ def _check_alike(left: Track, right: Track) -> None:
         )
 
 
-def _bridge_gaps(track: Track, start: int) -> Iterator[tuple[Shot, str | None]]:
-    """Yield a shot and its problem, if any, for each frame from number `start` on; replace missing frames."""
+def _bridge_gaps(track: Track, start: int, first: int) -> Iterator[tuple[Shot, str | None]]:
+    """Yield a shot and its problem, if any, for each frame from number `start` on; replace missing frames.
+
+    Decoding begins at a key frame at or before frame `first`.
+    """
     upcoming, last, after_damage = 0, None, False
-    for shot in track.shots(start):
+    for shot in track.shots(start, first):
         index = shot.number
         if not upcoming <= index < len(track.steps):
             continue

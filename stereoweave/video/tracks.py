@@ -7,14 +7,14 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from fractions import Fraction
 from functools import partial
-from itertools import count, islice, pairwise
+from itertools import count, dropwhile, islice, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import UInt8
 
-from stereoweave.errors import FormatError, StereoweaveError, require_extra
+from stereoweave.errors import FormatError, Remedy, StereoweaveError, require_extra
 from stereoweave.io.decoding import ENDINGS
 from stereoweave.io.images import read_image
 
@@ -98,22 +98,52 @@ class VideoTrack:
             self.size_px = self._frame_size_px if first.rotation % 180 == 0 else self._frame_size_px[::-1]
             self.declared_packing = _read_declared_packing(path, first)
 
-    def shots(self, start: int) -> Iterator[Shot]:
-        """Yield the frames that can be decoded, in display order, always beginning with the first frame.
+    def shots(self, start: int, first: int = 0) -> Iterator[Shot]:
+        """Yield the frames that can be decoded, in display order, from a key frame at or before `first` on.
 
-        `start` is ignored. The artefacts that follow a damaged frame depend on all earlier frames, so only
-        decoding from the beginning yields the same frames in every run.
+        `start` is ignored. The artefacts that follow a damaged frame depend on all frames before it, so only
+        decoding from the same key frame yields the same frames in every run.
         """
         with _opening(self._path) as (container, stream):
-            frames = _decode(container, stream)
-            placed = (
-                _number_by_rank(frames, stream)
-                if self._stamps is None
-                else _number_by_stamp(frames, self._stamps)
-            )
-            for index, frame in placed:
-                if not frame.is_corrupt and (frame.width, frame.height) == self._frame_size_px:
-                    yield Shot(index, partial(_convert_to_rgb, frame), frame.key_frame)
+            if first and self._stamps is not None:
+                shots = self._read_after_seek(container, stream, first)
+                opening = next(shots, None)
+                if opening and opening.number <= first:
+                    yield opening
+                    yield from shots
+                    return
+        with _opening(self._path) as (container, stream):
+            yield from self._read_shots(container, stream)
+
+    def _read_after_seek(
+        self, container: "av.container.InputContainer", stream: "av.VideoStream", first: int
+    ) -> Iterator[Shot]:
+        """Seek to the last key frame at or before a frame, and return the shots from a key frame on.
+
+        Containers without an index may seek to a later one.
+        """
+        import av
+
+        assert self._stamps is not None
+        try:
+            container.seek(self._stamps[first], stream=stream)
+        except av.error.FFmpegError:
+            return iter(())
+        # Frames before the key frame in display order refer to frames that are not decoded.
+        return dropwhile(lambda shot: not shot.is_key_frame, self._read_shots(container, stream))
+
+    def _read_shots(
+        self, container: "av.container.InputContainer", stream: "av.VideoStream"
+    ) -> Iterator[Shot]:
+        frames = _decode(container, stream)
+        placed = (
+            _number_by_rank(frames, stream)
+            if self._stamps is None
+            else _number_by_stamp(frames, self._stamps)
+        )
+        for index, frame in placed:
+            if not frame.is_corrupt and (frame.width, frame.height) == self._frame_size_px:
+                yield Shot(index, partial(_convert_to_rgb, frame), frame.key_frame)
 
     def samples(self) -> list[UInt8[np.ndarray, "h w 3"]]:
         """Return one or more images from different parts of the video."""
@@ -169,8 +199,11 @@ class PictureTrack:
         first = self._read_first()
         self.size_px = first.shape[1], first.shape[0]
 
-    def shots(self, start: int) -> Iterator[Shot]:
-        """Yield the readable pictures, beginning with the last readable one at or before `start`."""
+    def shots(self, start: int, first: int = 0) -> Iterator[Shot]:
+        """Yield the readable pictures, beginning with the last readable one at or before `start`.
+
+        `first` is ignored, because every picture is a key frame.
+        """
         before = next((index for index in range(start, 0, -1) if self._read_shot(index)), 0)
         yield from filter(None, map(self._read_shot, self.steps[before:]))
 
@@ -220,11 +253,14 @@ def open_track(path: Path, rate: Fraction | None) -> Track:
     if files is None:
         if rate is not None:
             raise StereoweaveError(
-                f"{path}: expected pictures, because a rate is given, found a video; omit the rate"
+                f"{path}: expected pictures, found a video, which has a rate of its own",
+                remedy=Remedy("leave the rate out", ("rate",)),
             )
         return VideoTrack(path)
     if not files:
-        raise FormatError(f"{path}: expected at least one picture, found none")
+        raise FormatError(
+            f"{path}: expected at least one picture, found none; name a folder that holds pictures"
+        )
     return PictureTrack(str(path), files, rate or Fraction(25))
 
 

@@ -174,7 +174,7 @@ def check_container(path: Path, sound: Path | None) -> None:
     """Raise StereoweaveError unless the extension of `path` selects a container that can hold the sound."""
     if path.suffix.lower() not in CONTAINERS:
         raise StereoweaveError(
-            f"{path}: expected the file extension {' or '.join(CONTAINERS)}, found {path.suffix!r}"
+            f"{path}: expected the file extension {' or '.join(CONTAINERS)}, found {path.suffix or 'none'}"
         )
     if sound is None or _can_hold(path.suffix, sound):
         return

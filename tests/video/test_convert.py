@@ -22,7 +22,7 @@ from stereoweave.io.colormap import colour_disparity
 from stereoweave.io.images import read_image, write_image
 from stereoweave.learn.data.collage import paint_collage
 from stereoweave.matching.matcher import Matcher
-from stereoweave.rendering.layouts import LAYOUTS, LayoutOptions, halve
+from stereoweave.rendering.layouts import LAYOUTS, LayoutOptions, squeeze
 from stereoweave.rendering.renderer import Renderer
 from stereoweave.stereo import StereoPair
 from stereoweave.video.reader import StereoFrame, StereoVideo, open_video
@@ -155,7 +155,7 @@ def test_a_layout_of_half_size_equals_the_full_one_halved(tmp_path, name, axis):
     whole, half = (
         rgb_of(next(tmp_path.glob(f"{layout}{LAYOUTS[layout].mark}.mp4")))[0] for layout in (full, name)
     )
-    eyes = [halve(eye, axis) for eye in np.split(whole, 2, axis)]
+    eyes = [squeeze(eye, axis) for eye in np.split(whole, 2, axis)]
     assert half.shape == np.concatenate(eyes, axis).shape
     assert np.abs(half.astype(int) - np.concatenate(eyes, axis)).mean() < 3
 
@@ -364,8 +364,8 @@ def test_a_damaged_frame_is_reported_with_its_time_and_does_not_end_the_video(tm
         ("out.mp4", ["--layout", "wiggle"], "--layout: expected one of side_by_side, "),
         ("out.mp4", ["--position", "2.5"], "--position: expected -1 to 2"),
         ("out.mp4", ["--position", "1", "--strength", "4"], "position 1 at strength 4"),
-        ("out.gif", ["--depth"], "expected the file extension .mp4 or .mkv or .mov, found '.gif'"),
-        ("out.mp4", ["--depth16"], "expected the file extension .mkv for 16-bit depth, found '.mp4'"),
+        ("out.gif", ["--depth"], "expected the file extension .mp4 or .mkv or .mov, found .gif"),
+        ("out.mp4", ["--depth16"], "expected the file extension .mkv for 16-bit depth, found .mp4"),
         ("in.mp4", ["--depth"], "expected an output file other than the input, found the same file"),
         ("out.mp4", ["--depth", "--model", "huge"], "unknown model 'huge'"),
         ("out.mp4", ["--depth", "--format", "diagonal"], "--format: expected one of side_by_side"),
@@ -375,7 +375,7 @@ def test_a_damaged_frame_is_reported_with_its_time_and_does_not_end_the_video(tm
         ("out.mp4", ["--depth", "--convergence", "3"], "--convergence: expected a view or a layout of views"),
         ("out.mkv", ["--depth16", "--strength", "2"], "as output, found depth16"),
         ("out.mp4", ["--layout", "rgbd", "--convergence", "0"], "as output, found layout rgbd"),
-        ("out.mp4", ["--depth", "--rate", "24"], "expected pictures, because a rate is given, found a video"),
+        ("out.mp4", ["--depth", "--rate", "24"], "expected pictures, found a video, which has a rate of its own; leave the rate out (--rate)"),
         ("out.mp4", ["--depth", "--rate", "1/0"], "--rate: expected frames per second"),
         ("out.mp4", ["--depth", "--rate", "-5"], "--rate: expected frames per second"),
         ("out.mp4", ["--depth", "--rate", "1e300"], "at most 1000, such as 24 or 30000/1001, found '1e300'"),

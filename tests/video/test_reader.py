@@ -23,7 +23,7 @@ from stereoweave.errors import StereoweaveError
 from stereoweave.io.images import write_image
 from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS, detect_layout, measure_resemblance
 from stereoweave.video.reader import open_video
-from stereoweave.video.tracks import _fill_missing, _number_by_rank, _separate_duplicates
+from stereoweave.video.tracks import _fill_missing, _number_by_rank, _separate_duplicates, open_track
 
 BEFORE = "damaged: replaced by the frame before it"
 SPOILT = "decoded from a damaged frame before it"
@@ -485,6 +485,35 @@ def test_an_excerpt_is_a_silent_video_of_its_own(tmp_path):
     assert [frame.time for frame in frames] == [Fraction(FRAME_MS * index, 1000) for index in range(5)]
     assert [frame.problem for frame in frames] == 5 * [None]
     assert_same(list(part.frames(2)), frames[2:])
+
+
+@pytest.mark.parametrize(
+    ("name", "codec", "options"),
+    [
+        ("video.mkv", "libx264", {"g": "8", "bf": "2"}),
+        ("video.mp4", "libx264", {"g": "8", "bf": "2", "x264-params": "open-gop=1:keyint=8:min-keyint=8"}),
+        ("video.avi", "mpeg4", {"g": "8"}),
+        ("video.ts", "libx264", {"g": "8", "bf": "2"}),
+        ("video.mkv", "mjpeg", {}),
+    ],
+)
+def test_an_excerpt_has_the_frames_of_the_whole_video(tmp_path, name, codec, options):
+    path = write_side_by_side(tmp_path / name, example_pairs(30), codec=codec, options=options)
+    video = open_video([path], "side_by_side")
+    frames = list(video.frames())
+    for first in (1, 15, 16, 17, 29):
+        part = video.excerpt(first / 25, 0.2)
+        found = list(part.frames())
+        assert len(found) == min(5, 30 - first)
+        for frame, expected in zip(found, frames[first:], strict=False):
+            assert_eyes([frame], [expected[:2]])
+            assert frame.problem is None
+
+
+def test_decoding_for_an_excerpt_begins_at_the_key_frame_before_it(tmp_path):
+    path = write_side_by_side(tmp_path / "video.mkv", example_pairs(30), codec="libx264", options={"g": "8"})
+    track = open_track(path, None)
+    assert [next(track.shots(0, first)).number for first in (0, 7, 8, 20, 29)] == [0, 0, 8, 16, 24]
 
 
 def test_an_excerpt_ends_with_its_video(tmp_path):
