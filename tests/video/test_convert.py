@@ -375,7 +375,7 @@ def test_a_damaged_frame_is_reported_with_its_time_and_does_not_end_the_video(tm
         ("out.mp4", ["--depth", "--convergence", "3"], "--convergence: expected a view or a layout of views"),
         ("out.mkv", ["--depth16", "--strength", "2"], "as output, found depth16"),
         ("out.mp4", ["--layout", "rgbd", "--convergence", "0"], "as output, found layout rgbd"),
-        ("out.mp4", ["--depth", "--rate", "24"], "a video, which has a rate of its own; leave the rate out (--rate)"),
+        ("out.mp4", ["--depth", "--rate", "24"], "which has a rate of its own; leave the rate out (--rate)"),
         ("out.mp4", ["--depth", "--rate", "1/0"], "--rate: expected frames per second"),
         ("out.mp4", ["--depth", "--rate", "-5"], "--rate: expected frames per second"),
         ("out.mp4", ["--depth", "--rate", "1e300"], "at most 1000, such as 24 or 30000/1001, found '1e300'"),
