@@ -12,6 +12,12 @@ def test_a_range_of_other_than_two_finite_ascending_numbers_is_refused(range_px)
         MatchOptions(range_px=range_px)
 
 
+@pytest.mark.usefixtures("without_shape_checks")
+def test_a_range_that_is_one_number_is_refused_with_the_number():
+    with pytest.raises(StereoweaveError, match="such as -20 and 150, got 64; omit it"):
+        MatchOptions(range_px=64)
+
+
 def test_invalid_options_are_refused_first():
     with pytest.raises(StereoweaveError, match="^range_px: "):
         sw.estimate("no picture", "no picture", model="no model", range_px=(5.0, 2.0))
