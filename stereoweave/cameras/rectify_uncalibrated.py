@@ -262,9 +262,8 @@ def _describe(chosen: _Candidate, matches: Matches) -> Note:
         changes.append("lens distortion was removed")
     if chosen.warps.right.field:
         changes.append("rows were bent where the rotation left them apart")
-    error = (
-        f"rectified with {len(matches.left_px)} matches: "
-        f"median vertical error {np.median(np.abs(moved.lower_px)):.2f} px "
-        f"({np.median(np.abs(matches.lower_px)):.2f} px before)"
+    rows = (
+        f"rectified: rows are off by {np.median(np.abs(moved.lower_px)):.2f} px, the median of "
+        f"{len(matches.left_px)} matches ({np.median(np.abs(matches.lower_px)):.2f} px before)"
     )
-    return Note("; ".join([error, *changes]))
+    return Note("; ".join([rows, *changes]))

@@ -58,7 +58,7 @@ def test_a_pair_rectified_by_its_features_passes_the_check(turned, tmp_path, cap
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["left.png", "right.png"]
     pair = read_pair(tmp_path / "out" / "left.png", tmp_path / "out" / "right.png")
     assert check_pair(pair.left, pair.right).defects == ()
-    assert "rectified with" in capsys.readouterr().out
+    assert "rectified: rows are off by" in capsys.readouterr().out
 
 
 def test_the_new_calibration_fits_the_new_pictures(tmp_path):

@@ -44,7 +44,7 @@ def test_a_view_of_an_aligned_estimate_shows_the_aligned_pair(lower):
 
 def test_the_estimate_says_how_the_pair_was_aligned(lower, example):
     (note,) = sw.estimate(*lower, align="auto").notes
-    assert str(note).startswith("rectified with ")
+    assert str(note).startswith("rectified: rows are off by ")
     assert sw.estimate(*lower).notes == ()
     swapped = sw.estimate(example.right, example.left, align="auto")
     assert list(map(str, swapped.notes)) == ["left and right were swapped, and have been swapped back"]
