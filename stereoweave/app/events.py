@@ -45,13 +45,15 @@ def connect_cancel(cancel: gr.Button, status: gr.HTML, events: Sequence[Any]) ->
         concurrency_limit=None,
         api_visibility="private",
     )
+    scroll_to(status, [cancel.click])
 
 
 def scroll_to(status: gr.HTML, triggers: Sequence[Any]) -> None:
-    """Scroll to the status at these triggers where it is out of sight, as below the form on a telephone."""
+    """Scroll to the status at these triggers if it is above the window, or below the form on a telephone."""
     look = f"""() => {{
         const status = document.getElementById("{status.elem_id}");
-        if (status.getBoundingClientRect().top > 0.5 * innerHeight)
+        const top = status.getBoundingClientRect().top;
+        if (top < 0 || top > 0.5 * innerHeight)
             status.scrollIntoView({{ behavior: "smooth" }});
     }}"""
     for trigger in triggers:

@@ -74,7 +74,7 @@ def show(  # noqa: PLR0913 - source, output and settings
     rig: Rig | None = None,
     tell: Callable[[Note], None] = lambda note: None,
 ) -> None:
-    """Show captured images and their disparity until the sources end.
+    """Show captured images and their disparity until the sources end; the last ones say so.
 
     Args:
         capture: Source of the images.
@@ -100,6 +100,8 @@ def show(  # noqa: PLR0913 - source, output and settings
         tally.add(moment, time.monotonic())
         status = f"{tally.rate:.1f} frames/s, {1000 * (tally.last_s[-1] - moment.taken_s):.0f} ms behind"
         screen.show(compose(pair, disparity_px, range_px, status))
+    if range_px:
+        screen.show(compose(pair, disparity_px, range_px, "the end"))
 
 
 def follow_range(
@@ -125,20 +127,18 @@ def compose(
         colours[~pair.left_seen] = 0
     both = np.hstack([_mark_middle(pair.left), _mark_middle(colours)])
     picture = cv2.copyMakeBorder(both, _STRIP_PX, 0, 0, 0, cv2.BORDER_CONSTANT)
-    _write(
-        picture, f"{status}; middle: {describe_middle(pair, disparity_px)}", (8, 22), picture.shape[1] - 16
-    )
+    _write(picture, f"{status}; {describe_middle(pair, disparity_px)}", (8, 22), picture.shape[1] - 16)
     return np.vstack([picture, _draw_legend(pair.camera, range_px, both.shape[1])])
 
 
 def describe_middle(pair: StereoPair, disparity_px: Float[np.ndarray, "h w"]) -> str:
-    """Return the depth around the middle of the left image, or the disparity if the camera is unknown."""
+    """Describe the depth at the cross in the left image, or the disparity if the camera is unknown."""
     height, width = disparity_px.shape
     rows, columns = (
         slice(max(0, side // 2 - _MIDDLE_PX), side // 2 + _MIDDLE_PX + 1) for side in (height, width)
     )
     [text] = label_values(pair.camera, [float(np.median(disparity_px[rows, columns]))])
-    return text
+    return f"{'disparity' if pair.camera is None else 'depth'} at the cross: {text}"
 
 
 def label_values(camera: StereoCamera | None, disparities_px: Sequence[float]) -> list[str]:

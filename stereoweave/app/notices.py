@@ -64,3 +64,13 @@ def format_legend(colours: str, *labels: str) -> str:
     """Format a strip of colours, a CSS background, with labels below it."""
     spans = "".join(f"<span>{label}</span>" for label in labels)
     return f'<div class="ramp" style="background:{colours}"></div><div class="ends">{spans}</div>'
+
+
+def format_frame(page: str, title: str, style: str = "") -> str:
+    """Format a page as a frame, whose scripts reach nothing outside it."""
+    # The sensors, for the phone's tilt and a headset.
+    allowed = "accelerometer *; gyroscope *; xr-spatial-tracking *"
+    return (
+        f'<iframe title="{title}" style="{style}" sandbox="allow-scripts" '
+        f'allow="{allowed}" srcdoc="{html.escape(page)}"></iframe>'
+    )

@@ -1,7 +1,6 @@
 """The page's form for a pair of pictures and its settings."""
 
 from collections.abc import Iterable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,12 +27,17 @@ LABELS = {
     "focal_px": "Focal length, px",
     "model": "Quality",
     "rectify": "Align the pictures",
-    "no_rectify": "Align the pictures",
     "crop": "Cut off borders",
     "position": "Viewpoint",
     "video": "Video",
 }
-label_of = partial(name_setting, LABELS)
+
+
+def label_of(setting: str) -> str | None:
+    """Return the form's name for a setting, or what to do with its field; None if it has no field."""
+    if setting == "no_rectify":
+        return f"untick {label_of('rectify')}"
+    return name_setting(LABELS, setting)
 
 
 class PairForm:

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
-from uuid import uuid4
 
 import gradio as gr
 
 from stereoweave.app.events import LIFETIME_S, MATCHING, Host, connect_cancel, scroll_to, switch
 from stereoweave.app.notices import (
     Wording,
+    format_frame,
     format_legend,
     format_notice,
     format_paragraphs,
@@ -31,7 +31,7 @@ from stereoweave.app.session import (
     measure_clicks,
     open_session,
     write_all,
-    write_cloud,
+    write_shown_report,
 )
 from stereoweave.app.stereo_picture_tab import StereoPictureTab
 from stereoweave.errors import Note, StereoweaveError
@@ -42,7 +42,7 @@ _EMPTY = """<div class="empty"><ol>
 <li>Drop the left and the right picture, or one file that holds both:
 side by side, one above the other, MPO or JPS.</li>
 <li>Press <b>Find depth</b>. Pictures taken by hand or by two separate cameras are aligned first.</li>
-<li>Move between the cameras, turn the points in 3-D, measure, and download 3-D pictures and files.</li>
+<li>Move between the cameras, turn the scene in 3-D, measure, and download 3-D pictures and files.</li>
 </ol></div>"""
 _ABOUT_FILES = """<p><b>report.html</b> shows the result in any browser; <b>preview.png</b> is the depth in
 colour. <b>depth</b> is in metres, <b>disparity</b> in pixels; <b>cloud</b> and <b>mesh</b> open in 3-D
@@ -50,16 +50,11 @@ programs. PNG files are for image editors; PFM, NPY and TIFF files are for progr
 thus depth, cloud and mesh, only with a calibration, or with focal length and baseline.</p>"""
 _ABOUT_NOTES = "What was done with the pictures:"
 _ABOUT_REMEDIES = "What was done with the pictures, and in brackets the field that changes it:"
-_GUESSED_POINTS = "The proportions are a guess: without a calibration, the cameras are unknown."
 _TO_MEASURE = "Click two points in the left picture to see their depths and the distance between them here."
 _TO_COMPARE = (
     "Click two points in the left picture to compare their disparities: what is nearer has a larger one. "
     "Distances in metres need a calibration file, or the focal length and the baseline."
 )
-_WITHOUT_WEBGL = """const canvas = document.createElement("canvas");
-if (!canvas.getContext("webgl2") && !canvas.getContext("webgl")) element.innerHTML =
-  '<p class="notice problem">This browser cannot draw in 3-D: turn on its hardware acceleration ' +
-  '(WebGL). If metres are known, open cloud.glb, under Files, in another program.</p>';"""
 _GONE = "This result has expired (results are kept for an hour). Find depth again."
 
 
@@ -86,14 +81,8 @@ class PairTab:
                 self._build_views()
             with gr.Tab("3-D picture") as self._picture_tab:
                 self._stereo = StereoPictureTab(self._host, self._wording, self._session, self._position)
-            with gr.Tab("3-D points") as self._cloud_tab:
-                gr.HTML(js_on_load=_WITHOUT_WEBGL, padding=False)
-                self._about_points = gr.HTML(elem_id="about-points")
-                self._cloud = gr.Model3D(
-                    label="Drag to turn, scroll or pinch to zoom",
-                    clear_color=(0.94, 0.95, 0.96, 1.0),
-                    height=560,
-                )
+            with gr.Tab("Explore") as self._report_tab:
+                self._report = gr.HTML(elem_id="report", padding=False, min_height=200)
             with gr.Tab("Measure"):
                 self._measured = gr.HTML(elem_id="measured")
                 self._clickable = _make_picture("Left picture", "clickable")
@@ -145,10 +134,21 @@ class PairTab:
             scroll_to(self._status, [found.then])
             long += [found, written]
             ends.append(written.then)
-        made = self._stereo.connect(self._picture_tab, form.cancel)
+        made = [self._connect_report(), *self._stereo.connect(self._picture_tab, form.cancel)]
         connect_cancel(form.cancel, self._status, [*long, *made])
         switch(form.cancel, [*ends, *(event.then for event in made)], on=False)
         self._connect_views()
+
+    def _connect_report(self) -> Any:
+        """Show the report when its tab is opened, because it cannot measure itself while hidden.
+
+        Returns:
+            The event that shows it.
+        """
+        switch(self._form.cancel, [self._report_tab.select], on=True)
+        return self._report_tab.select(
+            self._show_report, self._session, self._report, show_progress_on=self._report, **MATCHING
+        )
 
     def _connect_views(self) -> None:
         """Connect the events of the results that are drawn at once."""
@@ -161,9 +161,6 @@ class PairTab:
             concurrency_limit=None,
             api_visibility="private",
         )
-        # The point cloud is loaded when its tab is opened, under a new name each time. Gradio's viewer stays
-        # empty if its value arrives before the viewer is visible, or if the same value arrives twice.
-        self._cloud_tab.select(self._make_cloud, self._session, self._cloud, api_visibility="private")
         self._clickable.select(
             self._measure_click,
             [self._session, self._clicks],
@@ -181,8 +178,7 @@ class PairTab:
     @property
     def _shown_parts(self) -> list[Any]:
         pictures = [self._view, self._where, self._depth, self._ramp, self._confidence, self._clickable]
-        parts = [self._results, self._session, self._clicks, self._measured, self._tabs, self._cloud]
-        parts.append(self._about_points)
+        parts = [self._results, self._session, self._clicks, self._measured, self._tabs, self._report]
         return [*pictures, *parts, *self._stereo.parts]
 
     async def _find_depth(
@@ -257,8 +253,7 @@ class PairTab:
             self._clicks: [],
             self._tabs: gr.update(selected="first"),
             self._measured: format_paragraphs([_TO_MEASURE if pair.camera else _TO_COMPARE]),
-            self._cloud: None,
-            self._about_points: "" if session.result.pair.camera else format_paragraphs([_GUESSED_POINTS]),
+            self._report: "",
             self._files: None,
             self._all: gr.update(value=None, visible=False),
             **self._stereo.empty(),
@@ -272,10 +267,23 @@ class PairTab:
         unseen = f"{100 * (~view.drawn).mean():.1f} % of it filled in, as neither camera saw it"
         return view.image, f"{position:g}, {_describe_position(position)}; {unseen}"
 
-    def _make_cloud(self, session: Session | None) -> str | None:
-        """Write the point cloud, and return the path of its file; None if there is no point cloud."""
-        cloud = session and write_cloud(session.folder / f"{uuid4().hex}.glb", session.result)
-        return str(cloud) if cloud else None
+    async def _show_report(
+        self,
+        session: Session | None,
+        request: gr.Request,
+        progress: Any = gr.Progress(),  # noqa: B008
+    ) -> str:
+        """Write the report unless it is there, and return a frame that shows it, or an error."""
+        if session is None:
+            return format_paragraphs([_GONE])
+        file = session.shown_report
+        if not file.exists():
+            work = partial(write_shown_report, session.result, file)
+            try:
+                await self._host.work(request, work, progress)
+            except (StereoweaveError, OSError) as error:
+                return self._wording.format_error(error)
+        return format_frame(file.read_text(encoding="utf-8"), title="Report")
 
     def _measure_click(
         self, session: Session | None, clicks: list[tuple[int, int]], event: gr.SelectData

@@ -17,14 +17,13 @@ from stereoweave.matching.backend import Backend
 from stereoweave.matching.options import MatchOptions
 from stereoweave.outputs.measure import distance
 from stereoweave.outputs.metres import format_metres
-from stereoweave.outputs.point_cloud import EmptyError, make_point_cloud, write_glb
 from stereoweave.outputs.report import Summary
-from stereoweave.outputs.results import FILES, needs_camera, write_files
+from stereoweave.outputs.results import FILES, REPORT, needs_camera, write_files
 from stereoweave.outputs.run import Result, run
 from stereoweave.pictures.prepare import Prepared, Request, prepare
 from stereoweave.rendering.renderer import Renderer
 from stereoweave.rendering.scaling import fit_size, scale_down
-from stereoweave.stereo import Estimate, StereoCamera, StereoPair, assume_camera
+from stereoweave.stereo import Estimate, StereoPair
 
 _LONGER_SIDE_PX = 1280
 _MOST_POINTS = 300_000
@@ -65,6 +64,11 @@ class Session:
     def is_written(self) -> bool:
         """Whether the result's files are written."""
         return any((self.folder / name).exists() for name in FILES)
+
+    @property
+    def shown_report(self) -> Path:
+        """The report that the page shows, once it is asked for."""
+        return self.folder / "shown" / REPORT
 
     def given_px(self, shown_px: tuple[int, int]) -> tuple[int, int]:
         """Convert the column and row of a pixel in the displayed image to those in the full-size image."""
@@ -191,22 +195,11 @@ def zip_files(file: Path, files: Sequence[Path]) -> Path | None:
     return file
 
 
-def write_cloud(file: Path, result: Result) -> Path | None:
-    """Write the point cloud for the viewer, and return the file's path; None if there are no points.
-
-    The farthest points are left out; only the downloadable file `cloud.glb` has all points. If the camera is
-    unknown, a plausible camera is assumed.
-    """
-    pair, estimate = result.pair, result.estimate
-    seen = pair if pair.camera else replace(pair, camera=_assume_camera(estimate))
-    try:
-        cloud = make_point_cloud(seen, estimate, most_points=_MOST_POINTS)
-    except EmptyError:
-        return None
-    depth_m = cloud.points_m[:, 2]
-    near = depth_m <= _FARTHEST * np.median(depth_m)
-    write_glb(file, replace(cloud, points_m=cloud.points_m[near], colours=cloud.colours[near]))
-    return file
+def write_shown_report(result: Result, file: Path, report_progress: Callable[[float, str], None]) -> None:
+    """Write the report into a folder of its own, so that it links to no other files."""
+    report_progress(0.5, "drawing the report")
+    file.parent.mkdir(exist_ok=True)
+    write_files(file.parent, [file.name], result)
 
 
 def colour_depth(session: Session) -> UInt8[np.ndarray, "h w 3"]:
@@ -278,14 +271,3 @@ def _describe_pixel(result: Result, point: tuple[int, int]) -> str:
     if result.pair.camera:
         text += f", depth {format_metres(float(result.pair.camera.depth_m(disparity_px)[0, 0]))}"
     return f"{text}; confidence {100 * result.estimate.confidence[row, column]:.0f} %"
-
-
-def _assume_camera(estimate: Estimate) -> StereoCamera:
-    """Return a camera that gives a plausible point cloud, as if the cameras were as far apart as eyes are.
-
-    Negative disparities indicate converged cameras; points with the lowest disparities are then assumed to be
-    infinitely far away.
-    """
-    height, width = estimate.disparity_px.shape
-    least_px = float(np.percentile(estimate.disparity_px, 1))
-    return assume_camera((width, height), baseline_m=_EYES_M, doffs_px=max(0.0, -least_px))

@@ -1,6 +1,5 @@
 """The page's tab that offers a result as 3-D pictures, with a preview of each."""
 
-import html
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -9,7 +8,7 @@ from uuid import uuid4
 import gradio as gr
 
 from stereoweave.app.events import MATCHING, Host, switch
-from stereoweave.app.notices import Wording, format_paragraphs
+from stereoweave.app.notices import Wording, format_frame, format_paragraphs
 from stereoweave.app.pair_form import LABELS
 from stereoweave.app.stereo_pictures import AUTOMATIC_PX, FULL_PX, KINDS, Wish, write_stereo_picture
 from stereoweave.errors import StereoweaveError
@@ -137,7 +136,8 @@ class StereoPictureTab:
     def _show(self, shown: Path, shape: tuple[int, ...]) -> dict[Any, Any]:
         """Return the values of the parts that show a picture, or a page in a frame of the picture's shape."""
         is_page = shown.suffix == ".html"
-        frame = _format_frame(shown.read_text(encoding="utf-8"), shape) if is_page else ""
+        style = f"aspect-ratio: {shape[1]} / {shape[0]}"
+        frame = format_frame(shown.read_text(encoding="utf-8"), "3-D photo", style) if is_page else ""
         return {
             self._preview: gr.update(value=None if is_page else str(shown), visible=not is_page),
             self._page: gr.update(value=frame, visible=is_page),
@@ -147,13 +147,3 @@ class StereoPictureTab:
 def _describe(kind: str) -> tuple[str, Any]:
     """Return how to look at a kind, and whether its borders can be cut off."""
     return format_paragraphs([KINDS[kind].viewing]), gr.update(visible=Wish(kind=kind).can_crop)
-
-
-def _format_frame(page: str, shape: tuple[int, ...]) -> str:
-    """Format a page as a frame, whose scripts reach nothing outside it."""
-    # The sensors, for the phone's tilt and a headset.
-    allowed = "accelerometer *; gyroscope *; xr-spatial-tracking *"
-    return (
-        f'<iframe title="3-D photo" style="aspect-ratio: {shape[1]} / {shape[0]}" sandbox="allow-scripts" '
-        f'allow="{allowed}" srcdoc="{html.escape(page)}"></iframe>'
-    )

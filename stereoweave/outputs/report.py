@@ -22,7 +22,7 @@ from stereoweave.io.maps import find_scale, format_scale
 from stereoweave.io.text import writing_text
 from stereoweave.outputs.metres import format_metres
 from stereoweave.outputs.report_parts import (
-    download_list,
+    download_card,
     fill_template,
     jpeg_uri,
     list_box,
@@ -207,7 +207,7 @@ def _collect_fields(
         "ramp": ",".join(legend_colours(24)),
         "ticks": "".join(f"<span>{tick}</span>" for tick in _label_ticks(range_px, pair.camera)),
         "occluded_colour": css_colour(OCCLUDED_RGB),
-        "downloads": download_list(context.files),
+        "downloads": download_card(context.files),
         "command": term_list([("Command", context.command)], kind="long") if context.command else "",
         "making": term_list(_list_making(context)),
         # "</" would end the script element that contains the data.

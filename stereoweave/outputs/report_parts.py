@@ -73,17 +73,20 @@ def term_list(rows: Sequence[tuple[str, str]], kind: str = "short") -> str:
     )
 
 
-def download_list(files: Sequence[Path]) -> str:
-    """Return links to files in the report's folder, with content and size; a sentence if there are none."""
+def download_card(files: Sequence[Path]) -> str:
+    """Return links to files in the report's folder, with content and size; nothing if there are none."""
     if not files:
-        return '<p class="note">No other files were written with this report.</p>'
+        return ""
     items = "".join(
         f'<li><a href="{name}" download>{name}</a> <span>{CONTENTS[file.name]}</span>'
         f"<span>{_format_size(file.stat().st_size)}</span></li>"
         for file, name in ((file, html.escape(file.name)) for file in files)
     )
     note = "These files are in the folder of this page: send them along if you send it."
-    return f'<ul class="files">{items}</ul><p class="note">{note}</p>'
+    return f"""<section class="card" aria-labelledby="files-heading">
+      <h2 id="files-heading">Files</h2>
+      <ul class="files">{items}</ul><p class="note">{note}</p>
+    </section>"""
 
 
 def view_tags(positions: Sequence[float], images: Sequence[UInt8[np.ndarray, "h w 3"]]) -> str:
