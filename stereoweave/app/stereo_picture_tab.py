@@ -19,6 +19,13 @@ _SIZES = [
     ("full", FULL_PX),
     *((f"{side} px", side) for side in (2560, 1600, 1080, 640)),
 ]
+# Gradio opens the list scrolled to its end.
+_SHOW_CHOICE = """() => setTimeout(() => {
+    const list = document.querySelector("#kind [role=listbox]");
+    if (!list) return;
+    list.scrollTop = 0;
+    list.querySelector("[aria-selected=true]")?.scrollIntoView({ block: "nearest" });
+}, 100)"""
 
 
 class StereoPictureTab:
@@ -81,6 +88,7 @@ class StereoPictureTab:
         begins = [tab.select, self._kind.input, self._size.input, self._crops.input]
         switch(cancel, begins, on=True)
         asked: set[Any] = {self._session, self._kind, self._size, self._crops, self._position}
+        self._kind.focus(None, None, None, js=_SHOW_CHOICE, api_visibility="private")
         self._kind.input(
             _describe,
             self._kind,

@@ -234,8 +234,8 @@ def _show_views(pair: StereoPair, estimate: Estimate, threads: int | None) -> _V
     return _Views(
         fields={
             "views": view_tags(POSITIONS, list(render_views(renderer, POSITIONS))),
-            "first": first,
-            "last": last,
+            "first": f"{first:g}",
+            "last": f"{last:g}",
             "left_end": left_end,
             "right_end": right_end,
             "left": photo.pop("front"),

@@ -283,7 +283,8 @@ def test_the_middle_s_depth_is_the_median_around_it():
     disparity_px = np.full((40, 60), 6, np.float32)
     disparity_px[16:25, 26:35] = 30  # 600 * 0.1 / 30 = 2 m
     disparity_px[20, 30] = 6  # a pixel alone does not count
-    assert describe_middle(StereoPair(left=grey, right=grey, camera=camera), disparity_px) == "2.00 m"
+    pair = StereoPair(left=grey, right=grey, camera=camera)
+    assert describe_middle(pair, disparity_px) == "depth at the cross: 2.00 m"
 
 
 def test_a_looped_video_begins_again_at_its_end(tmp_path):
@@ -329,6 +330,17 @@ def test_of_an_odd_width_the_last_column_is_dropped_and_told_once(tmp_path):
         show(capture, screen, Matcher(), tally, format="side_by_side", tell=told.append)
     assert tally.shown > 0
     assert list(map(str, told)) == ["the last column is dropped, because the width, 321 px, is odd"]
+
+
+def test_after_the_last_frame_the_picture_says_so(tmp_path, monkeypatch):
+    said = []
+    monkeypatch.setattr(
+        "stereoweave.app.live.compose", lambda *shown: said.append(shown[3]) or compose(*shown)
+    )
+    cv2.imwrite(str(tmp_path / "0.png"), example_frame()[..., ::-1])
+    with Screen(0) as screen, Capture([str(tmp_path / "%d.png")]) as capture:
+        show(capture, screen, Matcher(), LiveTally(), format="side_by_side")
+    assert [line.split(",")[0] for line in said] == ["0.0 frames/s", "the end"]
 
 
 def test_two_videos_are_shown_as_the_left_image_and_its_disparity(tmp_path):
