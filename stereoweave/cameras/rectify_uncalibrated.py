@@ -114,8 +114,11 @@ def apply_warps(pair: StereoPair, warps: Warps) -> StereoPair:
     return replace(pair, left=left, right=right, camera=None, left_seen=left_seen, right_seen=right_seen)
 
 
-def fit_warps(pair: StereoPair) -> Fit:
-    """Fit the warps of `rectify_by_features`; raises the same errors."""
+def fit_warps(pair: StereoPair, *, parallel: bool = False) -> Fit:
+    """Fit the warps of `rectify_by_features`; raises the same errors.
+
+    With `parallel`, a pair's camera is known to have parallel axes, which are not measured.
+    """
     height, width = pair.left.shape[:2]
     scale = max(1.0, (width * height / _PIXELS_OF_DISTANCE) ** 0.5)
     found = find_matches(pair.left, pair.right)
@@ -124,7 +127,7 @@ def fit_warps(pair: StereoPair) -> Fit:
         with suppress(StereoweaveError):
             cameras = fit_cameras(first, (width, height), pair.camera.focal_px)
             cameras = _fit_closely(cameras, found, scale)
-            if abs(np.degrees(cameras.toe_in)) < _MOST_TOE_IN_DEGREES:
+            if parallel or abs(np.degrees(cameras.toe_in)) < _MOST_TOE_IN_DEGREES:
                 return _finish(replace(cameras, parallel=True), found, scale)
     return _finish(_fit_closely(fit_cameras(first, (width, height)), found, scale), found, scale)
 
