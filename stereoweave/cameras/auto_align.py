@@ -46,7 +46,7 @@ def align(pair: StereoPair, *, always: bool = False, parallel: bool = False) -> 
     Args:
         pair: The pair.
         always: Rectify sound pairs too, and raise the errors of `rectify_by_features`.
-        parallel: Take the axes of the pair's camera for parallel, as its maker states.
+        parallel: The maker of the pair's camera states that its axes are parallel (see `fit_warps`).
     """
     rectify = partial(_rectify if always else align_rows, parallel=parallel)
     aligned = rectify(pair)
