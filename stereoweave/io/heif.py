@@ -48,7 +48,7 @@ def open_heif(path: Path) -> Image.Image:
         Exception: The file is damaged; pillow-heif raises SyntaxError, ValueError and others.
     """
     try:
-        with require_extra("heic", f"{path}: reading HEIC, the format of spatial photos, needs pillow-heif"):
+        with require_extra("heic", f"{path}: expected a picture, found HEIC, which needs pillow-heif"):
             from pillow_heif import HeifImageFile
     except StereoweaveError as missing:
         raise FormatError.from_error(missing) from missing
