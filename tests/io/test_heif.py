@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pillow_heif
 import pytest
+from heic_examples import LOSSLESS, write_heic
 from picture_examples import DISPLAY_P3, profile, refusal_of
 from PIL import Image, ImageOps
 from video_examples import shrunk
@@ -23,8 +24,6 @@ from stereoweave.pictures.prepare import Request, prepare
 from stereoweave.stereo import StereoPair
 
 TEXTURED = Path(__file__).resolve().parents[1] / "textured_pair"
-# Blue and green swapped by a wrong matrix, or range, would be off by more than 10 levels.
-LOSSLESS = {"quality": -1, "chroma": 444, "matrix_coefficients": 0}
 ORIENTATION, EXIF, FOCAL_35_MM = 0x0112, 0x8769, 0xA405
 POSE = bytes.fromhex("4363e9145b7d4aab97aebea69803b434")
 ADJUSTMENT = bytes.fromhex("de22508536cb436587432f8705e7c78a")
@@ -40,17 +39,6 @@ def pair():
 def spatial(testdata):
     """Return a spatial photo of 2560x2560 px, of another program's making."""
     return testdata / "consumer" / "vision-pro.HEIC"
-
-
-def write_heic(path, *images, icc_profile=None, exif=None, **options):
-    """Write images of 8 bits without loss; with an EXIF orientation, as a camera that lay so would."""
-    file = pillow_heif.HeifFile()
-    for image in map(Image.fromarray, images):
-        added = file.add_frombytes(image.mode, image.size, image.tobytes())
-        tags = {"icc_profile": icc_profile, "exif": None if exif is None else exif.tobytes()}
-        added.info |= {key: value for key, value in tags.items() if value}
-    file.save(path, **LOSSLESS | options)
-    return path
 
 
 def assert_same(found, expected, tolerance=0.5):
