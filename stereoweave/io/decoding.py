@@ -19,6 +19,7 @@ from PIL import Image, UnidentifiedImageError, features
 
 from stereoweave.errors import FormatError, Remedy, reason
 from stereoweave.io import exif, heif
+from stereoweave.io.colour_profiles import make_profile
 from stereoweave.io.similar_names import describe_missing
 from stereoweave.stereo import LONGEST_SIDE_PX
 
@@ -268,7 +269,8 @@ def _to_eight_bits(path: Path, picture: Image.Image) -> Image.Image:
 
 def _convert_to_srgb(picture: Image.Image) -> tuple[Image.Image, str | None]:
     """Convert a picture to sRGB. Returns it, with a note if its colour profile was damaged or not sRGB."""
-    profile, mode = picture.info.get("icc_profile"), _PROFILED.get(picture.mode)
+    profile = picture.info.get("icc_profile") or make_profile(picture.info.get("nclx_profile"))
+    mode = _PROFILED.get(picture.mode)
     if not profile or mode is None:
         return picture, None
     from PIL import ImageCms

@@ -17,6 +17,7 @@ from video_examples import shrunk
 from stereoweave.cameras.alignment import check_pair
 from stereoweave.errors import FormatError
 from stereoweave.io import heif
+from stereoweave.io.decoding import read_picture
 from stereoweave.io.images import read_image
 from stereoweave.pictures.loading import open_pictures, pixel_factor
 from stereoweave.pictures.pair_finding import find_pairs_in
@@ -281,6 +282,24 @@ def test_a_colour_profile_is_applied_to_both_views(tmp_path):
     for image in (opened.pair.left, opened.pair.right):
         assert np.abs(image.astype(int) - (255, 0, 0)).max() <= 2
     assert "colours converted from Display P3" in map(str, opened.notes)
+
+
+@pytest.mark.parametrize(
+    ("primaries", "curve", "stored", "name"),
+    [
+        # By CSS Color 4, the red of sRGB is color(display-p3 0.917 0.200 0.139). In linear light, it is
+        # (0.6274, 0.0691, 0.0164) of BT.2020 (ITU-R BT.2087); 0.8137, 0.2914, 0.1353 on the curve of sRGB.
+        (12, 13, (234, 51, 35), "Display P3"),
+        (9, 13, (207, 74, 34), "BT.2020"),
+        (9, 16, (207, 74, 34), "BT.2020 (PQ, brightness unchanged)"),
+    ],
+)
+def test_colours_stated_in_numbers_are_converted(tmp_path, primaries, curve, stored, name):
+    image = np.full((48, 64, 3), stored, np.uint8)
+    options = {"color_primaries": primaries, "transfer_characteristics": curve}
+    decoded = read_picture(write_heic(tmp_path / "a.heic", image, **options))
+    assert np.abs(decoded.upright(None).astype(int) - (255, 0, 0)).max() <= 6
+    assert decoded.note == f"colours converted from {name}"
 
 
 def test_without_pillow_heif_the_error_names_the_extra(tmp_path, pair, monkeypatch):
