@@ -166,9 +166,10 @@ class Estimate:
             left image.
         confidence: Estimated probability, float32 in 0..1, that disparity_px is within 1 px of the truth.
         occluded: Mask, bool, of the pixels that only the left camera sees.
-        pair: The aligned pair that the estimate belongs to, if `estimate` aligned it; None if the estimate
-            belongs to the images as given.
-        notes: Notes on how `estimate` aligned the pair, or why it could not; `str` gives their text.
+        pair: The pair that the estimate belongs to, if `estimate` aligned it or opened it from one file; None
+            if the estimate belongs to the images as given.
+        notes: Notes on how `estimate` opened or aligned the pair, or why it could not align it; `str` gives
+            their text.
     """
 
     disparity_px: Float[np.ndarray, "h w"]

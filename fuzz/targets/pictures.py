@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 from PIL import Image, ImageCms, features
+from pillow_heif import HeifFile
 
 from fuzz.repairs import repair_png
 from fuzz.targets import Target, read_every_way, write_to_bytes
@@ -43,8 +44,21 @@ def _starts() -> dict[str, bytes]:
         **dict(_with_tags(both)),
         "eyes.mpo": write_to_bytes("eyes.mpo", lambda path: write_picture(path, both)),
         "eyes.jps": write_to_bytes("eyes.jps", lambda path: write_picture(path, both)),
+        "eyes.heic": _encode_heic(left, right),
         "above_TB.png": encode_picture(np.vstack([left, right]), "PNG"),
     }
+
+
+def _encode_heic(*images: np.ndarray) -> bytes:
+    """Return a HEIC file with these images, a description of a camera among their tags."""
+    exif = Image.Exif()
+    exif[0x0110], exif[0x0112] = "Some phone", 6
+    file, stream = HeifFile(), io.BytesIO()
+    for image in images:
+        added = file.add_frombytes("RGB", image.shape[1::-1], image.tobytes())
+        added.info["exif"] = exif.tobytes()
+    file.save(stream)
+    return stream.getvalue()
 
 
 def _plain(both: np.ndarray, grey: np.ndarray) -> Iterator[tuple[str, bytes]]:
@@ -85,6 +99,7 @@ TARGET = Target(
     read=_read,
     tokens=(
         *b"IHDR IDAT IEND tRNS PLTE acTL eXIf iCCP II*\0 MM\0* RIFF VP8L ANIM GIF89a P6 BM ftypavif".split(),
+        *b"ftypheic meta iloc iinf infe iprp ipco ipma ispe hvcC irot grpl ster idat mdat".split(),
         *(b"\xff\xd8", b"\xff\xd9", b"\xff\xe1", b"\xff\xe2MPF\0", b"\xff\xe3_JPSJPS_", b"Exif\0\0", b"jP  "),
         *(b"\x21\xf9\x04", b"\x2c", b"acsp", b"GImage:"),
     ),

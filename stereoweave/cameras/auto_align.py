@@ -1,6 +1,7 @@
 """Automatic alignment of a pair of unknown cameras: swaps its sides and rectifies it where needed."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 from stereoweave.cameras.alignment import Alignment, check_pair
 from stereoweave.cameras.camera_fit import Warps
@@ -36,7 +37,7 @@ class Aligned:
     warps: Warps | None = None
 
 
-def align(pair: StereoPair, *, always: bool = False) -> Aligned:
+def align(pair: StereoPair, *, always: bool = False, parallel: bool = False) -> Aligned:
     """Rectify a pair if its rows are apart, and swap its sides if they are swapped.
 
     A sound pair, or one with too few matches, is returned as it is. A pair whose rows would not come closer
@@ -45,24 +46,26 @@ def align(pair: StereoPair, *, always: bool = False) -> Aligned:
     Args:
         pair: The pair.
         always: Rectify sound pairs too, and raise the errors of `rectify_by_features`.
+        parallel: The maker of the pair's camera states that its axes are parallel (see `fit_warps`).
     """
-    aligned = _rectify(pair) if always else align_rows(pair)
+    rectify = partial(_rectify if always else align_rows, parallel=parallel)
+    aligned = rectify(pair)
     # Of a rectified pair, the signs of the disparities must agree with the depth order.
     suspicious = aligned.warps is not None or "swapped" in aligned.alignment.defects
     if not suspicious or _find_depth_order(aligned) >= _SWAPPED_VOTE:
         return aligned
-    other = _rectify(swap(pair)) if always else align_rows(swap(pair))
+    other = rectify(swap(pair))
     return replace(other, swapped=True, notes=(_SWAPPED, *other.notes))
 
 
-def align_rows(pair: StereoPair) -> Aligned:
+def align_rows(pair: StereoPair, *, parallel: bool = False) -> Aligned:
     """Rectify a pair if its rows are apart, as `align` does, without swapping its sides."""
     before = check_pair(pair.left, pair.right)
     as_it_is = Aligned(pair=pair, alignment=before)
     if not before.is_known or before.is_rectified:
         return as_it_is
     try:
-        rectified = _rectify(pair)
+        rectified = _rectify(pair, parallel=parallel)
     except StereoweaveError as error:
         note = Note(f"the pair could not be rectified: {error.message}", error.remedy)
         return replace(as_it_is, notes=(note,))
@@ -71,8 +74,8 @@ def align_rows(pair: StereoPair) -> Aligned:
     return replace(rectified, notes=tuple(replace(note, remedy=_KEEP) for note in rectified.notes))
 
 
-def _rectify(pair: StereoPair) -> Aligned:
-    fit = fit_warps(pair)
+def _rectify(pair: StereoPair, *, parallel: bool) -> Aligned:
+    fit = fit_warps(pair, parallel=parallel)
     rectified = fit.apply(pair)
     alignment = check_pair(rectified.left, rectified.right)
     return Aligned(pair=rectified, alignment=alignment, notes=(fit.note,), warps=fit.warps)

@@ -145,6 +145,13 @@ def fit_cameras(matches: Matches, size_px: tuple[int, int], known_focal_px: floa
     return min((_fit_from(start, matches) for start in starts), key=lambda found: found[1])[0]
 
 
+def make_parallel_cameras(size_px: tuple[int, int], focal_px: float) -> CameraFit:
+    """Return cameras that look into the same direction, without distortion; their warps change nothing."""
+    parameters = np.zeros(len(_LIKELY))
+    parameters[_LOG_FOCAL] = np.log(focal_px / size_px[0])
+    return CameraFit(parameters=parameters, size_px=size_px, known_focal_px=focal_px, parallel=True)
+
+
 def fit_again(start: CameraFit, matches: Matches) -> CameraFit:
     """Fit the cameras to other matches, starting from an earlier fit."""
     return _fit_from(start, matches)[0]

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from stereoweave.cameras.camera_fit import CameraFit, Warps, fit_again, fit_cameras
+from stereoweave.cameras.camera_fit import CameraFit, Warps, fit_again, fit_cameras, make_parallel_cameras
 from stereoweave.cameras.feature_matches import Matches, find_matches
 from stereoweave.cameras.rectify import Rectified
 from stereoweave.cameras.row_field import RowField, fit_row_field
@@ -114,12 +114,21 @@ def apply_warps(pair: StereoPair, warps: Warps) -> StereoPair:
     return replace(pair, left=left, right=right, camera=None, left_seen=left_seen, right_seen=right_seen)
 
 
-def fit_warps(pair: StereoPair) -> Fit:
-    """Fit the warps of `rectify_by_features`; raises the same errors."""
+def fit_warps(pair: StereoPair, *, parallel: bool = False) -> Fit:
+    """Fit the warps of `rectify_by_features`; raises the same errors.
+
+    With `parallel`, the maker of the pair's camera states parallel axes and no distortion: rows are then only
+    bent, which keeps the disparities, unless this leaves them too far apart.
+    """
     height, width = pair.left.shape[:2]
     scale = max(1.0, (width * height / _PIXELS_OF_DISTANCE) ** 0.5)
     found = find_matches(pair.left, pair.right)
     first = _select_inliers(found, scale * _FIRST_PX)
+    if pair.camera and parallel:
+        with suppress(StereoweaveError):
+            stated = make_parallel_cameras((width, height), pair.camera.focal_px)
+            unturned = _Candidate(stated, stated.make_warps())
+            return _make_fit(_bend_rows(unturned, found, scale) or unturned, found, scale)
     if pair.camera:
         with suppress(StereoweaveError):
             cameras = fit_cameras(first, (width, height), pair.camera.focal_px)
@@ -141,6 +150,11 @@ def _finish(cameras: CameraFit, found: Matches, scale: float) -> Fit:
         cameras = _fit_again(cameras, found, scale * _SELECTIONS_PX[-1])
     smooth = _bend_rows(_place(cameras, found, scale), found, scale)
     chosen = smooth or _place(_fit_again(cameras, found, scale * _RIGHT_PX), found, scale)
+    return _make_fit(chosen, found, scale)
+
+
+def _make_fit(chosen: _Candidate, found: Matches, scale: float) -> Fit:
+    """Return the fit of these warps; raise a StereoweaveError if they leave the rows apart."""
     missed_px = np.abs(chosen.warps.transform(found).lower_px)
     agreeing = _require_enough(found, missed_px < scale * _RIGHT_PX)
     _check(chosen.cameras, float(np.median(missed_px[missed_px < scale * _SELECTIONS_PX[-1]])), scale)
@@ -261,7 +275,8 @@ def _describe(chosen: _Candidate, matches: Matches) -> Note:
     if abs(chosen.cameras.distortion) > _NOTABLE_DISTORTION:
         changes.append("lens distortion was removed")
     if chosen.warps.right.field:
-        changes.append("rows were bent where the rotation left them apart")
+        turned = chosen.cameras.largest_degrees > 0
+        changes.append("rows were bent" + (" where the rotation left them apart" if turned else ""))
     rows = (
         f"rectified: rows are off by {np.median(np.abs(moved.lower_px)):.2f} px, the median of "
         f"{len(matches.left_px)} matches ({np.median(np.abs(matches.lower_px)):.2f} px before)"

@@ -18,7 +18,8 @@ from jaxtyping import Shaped, UInt8
 from PIL import Image, UnidentifiedImageError, features
 
 from stereoweave.errors import FormatError, Remedy, reason
-from stereoweave.io import exif
+from stereoweave.io import exif, heif
+from stereoweave.io.colour_profiles import make_profile
 from stereoweave.io.similar_names import describe_missing
 from stereoweave.stereo import LONGEST_SIDE_PX
 
@@ -27,9 +28,9 @@ from stereoweave.stereo import LONGEST_SIDE_PX
 MOST_PIXELS = 65_000_000
 A_PICTURE = "a picture (PNG, JPEG, TIFF or the like)"
 # File extensions by which pictures in a folder are found; a file's format is detected from its content.
-ENDINGS = frozenset(
-    {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp", ".gif", ".jp2", ".pgm", ".ppm", ".avif"}
-)
+ENDINGS = heif.ENDINGS | {
+    *(".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp", ".gif", ".jp2", ".pgm", ".ppm", ".avif")
+}
 # Not all of Pillow's formats: a PostScript file, for example, would run as a program. JPEG includes MPO and
 # JPS.
 _KINDS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "GIF", "PPM", "AVIF", "JPEG2000")
@@ -39,7 +40,6 @@ _RAW_ENDINGS = {
     *(".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw", ".x3f"),
 }
 _VIDEO_ENDINGS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v", ".wmv")
-_HEIF_BRANDS = {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"}
 _AVIF_BRANDS = {b"avif", b"avis"}
 _MP_ENTRIES, _DISPARITY = 0xB002, "Multi-Frame Image: (Disparity)"
 _LONGEST_WORDS = 100
@@ -72,10 +72,11 @@ def open_picture(path: Path, *, views: int = 1, expected: str = A_PICTURE) -> It
     """
     check_regular(path, expected)
     with _decoding(path, expected), path.open("rb") as file:
-        head = file.read(64)
-    _refuse_by_name(path, head)
+        brands = _find_brands(file.read(64))
+    _refuse_by_name(path, brands)
+    is_heif = not brands & _AVIF_BRANDS and bool(brands & heif.BRANDS)
     with _decoding(path, expected):
-        picture = _open(path, path, views)
+        picture = heif.open_heif(path) if is_heif else _open(path, path, views)
     with picture:
         check_size(path, picture.size, views=views)
         _refuse_by_content(path, picture, views)
@@ -90,9 +91,16 @@ def read_picture(path: Path) -> DecodedPicture:
 
 def decode(path: Path, picture: Image.Image) -> DecodedPicture:
     """Decode an open picture, or the current frame if it has several."""
+    stated_px = picture.size
     with _decoding(path):
         # Load before reading the tags, because loading turns a TIFF upright and updates its orientation tag.
         picture.load()
+    if picture.format == heif.FORMAT and picture.size != stated_px:
+        raise FormatError(
+            f"{path}: expected {_format_size(stated_px)} pixels, as its header states, found "
+            f"{_format_size(picture.size)}",
+            remedy=Remedy("copy it again"),
+        )
     tags = exif.read_tags(picture)
     if picture.mode.startswith(("I", "F")):
         return DecodedPicture(_to_eight_bits(path, picture), tags, None)
@@ -188,30 +196,32 @@ def _open(path: str | Path, source: Path | io.BytesIO, views: int) -> Image.Imag
         ) from error
 
 
+def _format_size(size_px: tuple[int, int]) -> str:
+    return f"{size_px[0]}x{size_px[1]}"
+
+
 def _format_limit(views: int) -> str:
     return f"at most {views * MOST_PIXELS // 1_000_000} megapixels"
 
 
-def _refuse_by_name(path: Path, head: bytes) -> None:
-    """Raise a FormatError for an unsupported format, detected from the file name or the first bytes."""
+def _find_brands(head: bytes) -> set[bytes]:
+    """Return the brands in the first bytes of a file in boxes (ISO/IEC 14496-12); empty for other files."""
+    return {head[start : start + 4] for start in (8, *range(16, 64, 4))} if head[4:8] == b"ftyp" else set()
+
+
+def _refuse_by_name(path: Path, brands: set[bytes]) -> None:
+    """Raise a FormatError for an unsupported format, detected from the file name or the brands."""
     ending = path.suffix.lower()
     if ending in _RAW_ENDINGS:
         raise FormatError(
             f"{path}: expected {A_PICTURE}, found a camera raw file; convert it to one of these formats first"
         )
-    brands = {head[start : start + 4] for start in (8, *range(16, 64, 4))} if head[4:8] == b"ftyp" else set()
     if brands & _AVIF_BRANDS:
         if not features.check("avif"):
             raise FormatError(
                 f"{path}: expected {A_PICTURE}, found AVIF, which the installed Pillow cannot read"
             )
-    elif brands & _HEIF_BRANDS:
-        raise FormatError(
-            f"{path}: expected {A_PICTURE}, found HEIC, the format of spatial photographs, "
-            "which is unsupported; export it as two JPEG files, or as one JPEG file with both views side by "
-            "side"
-        )
-    elif brands or ending in _VIDEO_ENDINGS:
+    elif not brands & heif.BRANDS and (brands or ending in _VIDEO_ENDINGS):
         raise FormatError(
             f"{path}: expected {A_PICTURE}, found a video", remedy=Remedy("convert it as such", ("video",))
         )
@@ -259,7 +269,8 @@ def _to_eight_bits(path: Path, picture: Image.Image) -> Image.Image:
 
 def _convert_to_srgb(picture: Image.Image) -> tuple[Image.Image, str | None]:
     """Convert a picture to sRGB. Returns it, with a note if its colour profile was damaged or not sRGB."""
-    profile, mode = picture.info.get("icc_profile"), _PROFILED.get(picture.mode)
+    profile = picture.info.get("icc_profile") or make_profile(picture.info.get("nclx_profile"))
+    mode = _PROFILED.get(picture.mode)
     if not profile or mode is None:
         return picture, None
     from PIL import ImageCms
@@ -291,10 +302,13 @@ def _clean_text(text: str) -> str:
 
 
 def find_view_frames(path: Path, picture: Any) -> list[int]:
-    """Return the indices of the two frames that hold an MPO file's views, or those of a two-frame animation.
+    """Return the indices of the frames that hold the views: of an MPO or HEIC file, or of a short animation.
 
-    The list is empty if there is only one view.
+    The left view of a HEIC file comes first. The list is empty if there is only one view.
     """
+    if picture.format == heif.FORMAT:
+        with _decoding(path):
+            return heif.find_views(picture)
     if picture.format in _ANIMATIONS:
         return [0, 1] if _count_frames(path, picture) == 2 else []
     if picture.format != "MPO":
@@ -314,7 +328,7 @@ def find_view_frames(path: Path, picture: Any) -> list[int]:
 
 
 def read_frame(path: Path, picture: Image.Image, index: int) -> DecodedPicture:
-    """Decode a frame of an MPO file or an animation."""
+    """Decode a frame of an MPO or HEIC file or an animation."""
     _seek(path, picture, index)
     check_size(path, picture.size)
     decoded = decode(path, picture)
@@ -326,7 +340,8 @@ def _seek(path: Path, picture: Image.Image, index: int) -> None:
     """Seek to a frame, and drop the tags and the profile of the previous one."""
     if picture.tell() == index:
         return
-    for key in ("mp", "icc_profile"):
+    # A HEIC file replaces them all by itself, and would miss them when it comes back to the frame.
+    for key in ("mp", "icc_profile") if picture.format != heif.FORMAT else ():
         picture.info.pop(key, None)
     try:
         with warnings.catch_warnings(action="ignore"):

@@ -37,20 +37,31 @@ _TURNS = {
 
 @dataclass(frozen=True, kw_only=True)
 class Lens:
-    """Focal length and baseline from a picture's metadata.
+    """Focal length, baseline and convergence from a picture's metadata.
 
     Attributes:
         focal_px: Focal length in pixels of one view; None if unknown.
         baseline_m: Distance between the two lenses in metres; None if unknown.
+        convergence_px: Disparity that the camera's maker shows in the plane of the screen; None if unknown.
+        parallel: Whether the metadata states that both cameras look into the same direction.
+        source: Where they are written, for notes.
     """
 
     focal_px: float | None = None
     baseline_m: float | None = None
+    convergence_px: float | None = None
+    parallel: bool = False
+    source: str = "EXIF"
 
     def __post_init__(self) -> None:
         for name, value in (("focal_px", self.focal_px), ("baseline_m", self.baseline_m)):
             if value is not None and not 0 < value < math.inf:
                 raise StereoweaveError(f"{name} must be positive and finite, got {value}")
+
+    @property
+    def is_known(self) -> bool:
+        """Whether any of the values is known."""
+        return any(value is not None for value in (self.focal_px, self.baseline_m, self.convergence_px))
 
 
 def read_tags(picture: Image.Image) -> Tags:
@@ -83,7 +94,13 @@ def read_lens(tags: Tags, width_px: int, height_px: int) -> Lens | None:
     The views must show the camera's full image, at any scale; for a crop, the focal length would be wrong.
     """
     lens = Lens(focal_px=_find_focal_px(tags, width_px, height_px), baseline_m=_find_baseline_m(tags))
-    return None if lens == Lens() else lens
+    return lens if lens.is_known else None
+
+
+def take_plausible_focal_px(focal_px: Any, width_px: int, height_px: int) -> float | None:
+    """Return a focal length if a lens can have it at this size of the picture; else None."""
+    number, diagonal_px = _parse_positive(focal_px), math.hypot(width_px, height_px)
+    return number if number and _SHORTEST < number / diagonal_px < _LONGEST else None
 
 
 def _read_exif_tags(picture: Image.Image) -> dict[int, Any]:
@@ -118,7 +135,8 @@ def _find_focal_px(tags: Tags, width_px: int, height_px: int) -> float | None:
         _find_focal_on_film_px(tags, diagonal_px),
         _find_focal_on_sensor_px(tags, width_px),
     )
-    return next((px for px in lengths_px if px and _SHORTEST < px / diagonal_px < _LONGEST), None)
+    plausible = (take_plausible_focal_px(px, width_px, height_px) for px in lengths_px)
+    return next((px for px in plausible if px), None)
 
 
 def _find_focal_on_film_px(tags: Tags, diagonal_px: float) -> float | None:

@@ -6,18 +6,19 @@ from typing import Literal
 
 from stereoweave.arguments import describe
 from stereoweave.cameras import auto_align
-from stereoweave.errors import StereoweaveError
+from stereoweave.errors import Remedy, StereoweaveError
 from stereoweave.io.arrays import ImageLike, as_rgb
 from stereoweave.matching.backend import Backend
 from stereoweave.matching.estimate import match
 from stereoweave.matching.options import MatchOptions
 from stereoweave.matching.providers import CPU
+from stereoweave.pictures.prepare import Prepared, Request, prepare
 from stereoweave.stereo import Estimate, StereoPair
 
 
 def estimate(  # noqa: PLR0913 - all but the images are keyword-only and optional
     left: ImageLike,
-    right: ImageLike,
+    right: ImageLike | None = None,
     *,
     model: str | Path = "small",
     threads: int | None = None,
@@ -32,7 +33,8 @@ def estimate(  # noqa: PLR0913 - all but the images are keyword-only and optiona
     Args:
         left: Left image of at least 32x32 px: path, PIL image, RGB array [H, W, 3] or [3, H, W], or PyTorch
             tensor, of uint8, uint16 or floats in 0..1; see `arrays.as_rgb`.
-        right: Right image of the same size.
+        right: Right image of the same size. Default: `left` is the path of one file with both views, such as
+            a spatial photo; the estimate then holds the pair, with its camera if the file tells it.
         model: Name of a shipped network, `best`, or the path of an .onnx matcher file. `best` runs the
             network `base`, runs it again at up to 1.5 times the size, and refines the result. The network is
             loaded on the first call and cached.
@@ -52,10 +54,27 @@ def estimate(  # noqa: PLR0913 - all but the images are keyword-only and optiona
     if align is not None and not (isinstance(align, str) and align == "auto"):
         raise StereoweaveError(f"expected 'auto' or None, got {describe(align)}", setting="align")
     options = MatchOptions(range_px=range_px, refined=refined, raw=raw)
+    backend = Backend(model=model, threads=threads, provider=provider)
+    if right is None:
+        prepared = _open_both(left, aligned=bool(align))
+        return replace(
+            match(backend.matcher(), prepared.pair, options), pair=prepared.pair, notes=prepared.notes
+        )
     given = StereoPair(left=as_rgb(left, "left"), right=as_rgb(right, "right"))
-    matcher = Backend(model=model, threads=threads, provider=provider).matcher()
+    matcher = backend.matcher()
     if not align:
         return match(matcher, given, options)
     aligned = auto_align.align(given)
     found = match(matcher, aligned.pair, options)
     return replace(found, pair=None if aligned.pair is given else aligned.pair, notes=aligned.notes)
+
+
+def _open_both(file: ImageLike, *, aligned: bool) -> Prepared:
+    """Open the pair in one file with both views."""
+    if not isinstance(file, str | Path):
+        raise StereoweaveError(
+            f"expected a right image besides a left one that is no path, found {describe(None)}",
+            setting="right",
+            remedy=Remedy("give it, or the path of one file with both views"),
+        )
+    return prepare([Path(file)], Request(rectify=None if aligned else False))

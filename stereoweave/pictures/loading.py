@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from stereoweave.errors import FormatError, Note, Remedy, StereoweaveError
-from stereoweave.io import exif
+from stereoweave.io import exif, heif
 from stereoweave.io.decoding import (
     DecodedPicture,
     check_size,
@@ -51,10 +51,10 @@ class Opened:
 
     Attributes:
         pair: Both views, upright and in sRGB.
-        layout: Layout of the files, which is a name in `PAIR_LAYOUTS`, "mpo" or "two_pictures" (also for an
-            animation of two frames).
+        layout: Layout of the files, which is a name in `PAIR_LAYOUTS`, "mpo" or "two_pictures" (also for a
+            HEIC file with two views and an animation of two frames).
         notes: Notes on what was detected or changed.
-        lens: Camera parameters from EXIF, in pixels of the pair; None if EXIF has none.
+        lens: Camera parameters from the metadata, in pixels of the pair; None if there are none.
     """
 
     pair: StereoPair
@@ -110,8 +110,8 @@ def _advise_on_count(paths: Sequence[Path]) -> Remedy | None:
 def pixel_factor(path: Path, picture: Image.Image, format: str | None) -> int:
     """Return the ratio, 1 or 2, of the number of pixels in both views to the number in the file's header.
 
-    It is 2 for MPO files and animations of two frames, and for half-size views declared by `format` or by the
-    file's JPS header.
+    It is 2 for MPO and HEIC files with two views, for animations of two frames, and for half-size views
+    declared by `format` or by the file's JPS header.
     """
     if _find_frames(path, picture, format):
         return 2
@@ -121,7 +121,7 @@ def pixel_factor(path: Path, picture: Image.Image, format: str | None) -> int:
 
 def _find_frames(path: Path, picture: Image.Image, format: str | None) -> list[int]:
     """Return the frames that hold the two views; empty if one frame holds both, as far as `format` tells."""
-    if picture.format == "MPO" and format not in (None, "mpo"):
+    if picture.format in ("MPO", heif.FORMAT) and format not in (None, "mpo"):
         return []
     return find_view_frames(path, picture)
 
@@ -143,6 +143,8 @@ def _open_one(path: Path, format: str | None) -> Opened:
         frames = _find_frames(path, picture, format)
         if frames and picture.format == "MPO":
             return _open_mpo(path, picture, frames)
+        if frames and picture.format == heif.FORMAT:
+            return _open_heif(path, picture, frames)
         if frames:
             return _open_animation(path, picture, frames, format)
         if format == "mpo":
@@ -179,12 +181,8 @@ def _open_mpo(path: Path, picture: Image.Image, frames: Sequence[int]) -> Opened
     # CIPA DC-007 numbers viewpoints from the left; many files omit the number and store the left view first.
     decoded.sort(key=lambda each: exif.read_viewpoint(each.tags))
     left, right = (each.upright(lies) for each in decoded)
-    if left.shape != right.shape:
-        sizes = " and ".join(f"{eye.shape[1]}x{eye.shape[0]}" for eye in (left, right))
-        raise FormatError(f"{path}: expected an MPO file with two pictures of the same size, found {sizes}")
-    check_large_enough(path, left)
     return Opened(
-        pair=StereoPair(left=left, right=right),
+        pair=_pair_views(path, "an MPO", left, right),
         layout="mpo",
         notes=(
             Note("mpo, two pictures in one file", _OVERRIDE),
@@ -192,6 +190,42 @@ def _open_mpo(path: Path, picture: Image.Image, frames: Sequence[int]) -> Opened
             *_note_colours(decoded),
         ),
         lens=_read_lens(decoded),
+    )
+
+
+def _open_heif(path: Path, picture: Image.Image, frames: Sequence[int]) -> Opened:
+    """Open the pair in a HEIC file, whose left view comes first; pillow-heif turns both upright."""
+    left = read_frame(path, picture, frames[0])
+    lens = heif.read_lens(path, picture)
+    right = read_frame(path, picture, frames[1])
+    pair = _pair_views(path, "a HEIC", *(each.upright(None) for each in (left, right)))
+    return Opened(
+        pair=pair,
+        layout=TWO_PICTURES,
+        notes=(Note("a HEIC file with a left and a right view"), *_note_colours([left, right])),
+        lens=_complete_lens(lens, _read_lens([left, right])),
+    )
+
+
+def _pair_views(
+    path: Path, kind: str, left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h2 w2 3"]
+) -> StereoPair:
+    """Make the pair of a file of this kind. Raises FormatError if the sizes differ or are too small."""
+    if left.shape != right.shape:
+        sizes = " and ".join(f"{eye.shape[1]}x{eye.shape[0]}" for eye in (left, right))
+        raise FormatError(f"{path}: expected {kind} file with two pictures of the same size, found {sizes}")
+    check_large_enough(path, left)
+    return StereoPair(left=left, right=right)
+
+
+def _complete_lens(lens: exif.Lens | None, by_exif: exif.Lens | None) -> exif.Lens | None:
+    """Return a lens of a HEIC file, completed from EXIF."""
+    if lens is None or by_exif is None:
+        return lens or by_exif
+    return replace(
+        lens,
+        focal_px=lens.focal_px or by_exif.focal_px,
+        baseline_m=lens.baseline_m or by_exif.baseline_m,
     )
 
 

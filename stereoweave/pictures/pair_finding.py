@@ -20,8 +20,7 @@ from stereoweave.io.stores import store_at
 BATCH_FILE, SUMMARY_FILE = "batch.json", "summary.csv"
 _CALIBRATION = "calib.txt"
 _ENDINGS = {
-    # Unsupported formats are included, so that opening them fails with an error that names the format.
-    "picture": (*ENDINGS, ".heic", ".heif"),
+    "picture": tuple(ENDINGS),
     # These are pairs even if there are pictures beside them, because cameras also write an .mpo file's left
     # view as .jpg.
     "both views": (".mpo", ".jps", ".pns"),

@@ -26,7 +26,8 @@ class Request:
     Attributes:
         format: Layout of one picture with both views, a name in `loading.FORMATS`; default: detected.
         calibration: Calibration file of the two cameras (`calibration_files.read_rig`).
-        focal_px, baseline_m: Focal length and baseline, instead of a calibration; default: from EXIF.
+        focal_px, baseline_m: Focal length and baseline, instead of a calibration; default: from the
+            pictures' metadata.
         rectify: Whether to rectify the pair, using the calibration or, if there is none, feature matches.
             Default: `align` the pair, unless a calibration, focal length or baseline is given.
     """
@@ -64,9 +65,9 @@ class Prepared:
 def prepare(pictures: Sequence[Path], request: Request) -> Prepared:
     """Open a pair from two pictures (left first) or one picture with both views; rectify it if needed.
 
-    The camera comes from the calibration, from the request, or from EXIF. The pair has no camera if the
-    focal length or the baseline is unknown, or if rectification from feature matches did not find the cameras
-    parallel.
+    The camera comes from the calibration, from the request, or from the pictures' metadata. The pair has no
+    camera if the focal length or the baseline is unknown, or if the cameras are not known to be parallel and
+    rectification from feature matches did not find them so.
 
     Raises:
         StereoweaveError: See `open_pictures`, `read_rig`, `rectify` and `rectify_by_features`; or the request
@@ -81,10 +82,12 @@ def prepare(pictures: Sequence[Path], request: Request) -> Prepared:
             notes=(*opened.notes, *ready.notes),
             remedy=_CALIBRATE_AGAIN,
         )
-    camera, notes = _find_camera(opened.pair, opened.lens or Lens(), request)
+    lens = opened.lens or Lens()
+    camera, notes = _find_camera(opened.pair, lens, request)
     pair = replace(opened.pair, camera=camera)
     in_metres = request.focal_px is not None or request.baseline_m is not None
-    found = _align(pair, False if in_metres and request.rectify is None else request.rectify)
+    rectify = False if in_metres and request.rectify is None else request.rectify
+    found = _align(pair, rectify, parallel=lens.parallel)
     return Prepared(
         pair=found.pair,
         pictures=tuple(pictures),
@@ -112,14 +115,15 @@ def _apply_calibration(pair: StereoPair, path: Path, rectified: bool) -> Rectifi
 def _find_camera(
     pair: StereoPair, lens: Lens, request: Request
 ) -> tuple[StereoCamera | None, tuple[Note, ...]]:
-    """Return the request's camera, completed from EXIF, and a note on the values from EXIF."""
+    """Return the request's camera, completed from the metadata, and a note on these values."""
     focal_px = lens.focal_px if request.focal_px is None else request.focal_px
     baseline_m = lens.baseline_m if request.baseline_m is None else request.baseline_m
     if focal_px is not None and baseline_m is not None:
         camera = StereoCamera.centred(pair.left, focal_px=focal_px, baseline_m=baseline_m)
-        from_exif = [] if request.focal_px is not None else [f"focal length {focal_px:.0f} px"]
-        from_exif += [] if request.baseline_m is not None else [f"baseline {1000 * baseline_m:.1f} mm"]
-        return camera, (Note(f"from EXIF: {', '.join(from_exif)}"),) if from_exif else ()
+        read = [] if request.focal_px is not None else [f"focal length {focal_px:.0f} px"]
+        read += [] if request.baseline_m is not None else [f"baseline {1000 * baseline_m:.1f} mm"]
+        read += [] if lens.convergence_px is None else [f"convergence {lens.convergence_px:.0f} px"]
+        return camera, (Note(f"from {lens.source}: {', '.join(read)}"),) if read else ()
     if request.focal_px is not None:
         raise StereoweaveError(
             "metres: expected a baseline besides the focal length, found none in EXIF",
@@ -140,14 +144,14 @@ class _Ready:
     alignment: Alignment | None = None
 
 
-def _align(pair: StereoPair, rectified: bool | None) -> _Ready:
+def _align(pair: StereoPair, rectified: bool | None, *, parallel: bool) -> _Ready:
     """Rectify the pair from feature matches, always, never, or by default where needed.
 
     If the cameras were not parallel, the rectified pair has no camera, as disparity at infinity is unknown.
     """
     if rectified is False:
         return _Ready(pair)
-    aligned = align(pair, always=bool(rectified))
+    aligned = align(pair, always=bool(rectified), parallel=parallel)
     ready = _Ready(aligned.pair, aligned.notes, aligned.alignment)
     if pair.camera is None or ready.pair.camera is not None:
         return ready

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from browsers import chromium
+from heic_examples import write_heic
 from page_examples import start, stop
 from page_visits import Visit, visiting
 from PIL import Image
@@ -355,6 +356,12 @@ def test_five_seconds_of_a_video_are_shown_as_a_preview(visit, tmp_path):
         frames = [frame.to_ndarray(format="rgb24") for frame in shown.decode(video=0)]
     assert len(frames) == 125
     assert visit.refused == []
+
+
+def test_a_heic_file_with_both_views_is_a_pair(visit, pair, tmp_path):
+    views = (read_image(pair[side]) for side in ("left", "right"))
+    visit.give(left=write_heic(tmp_path / "photo.heic", *views))
+    assert "a HEIC file with a left and a right view" in visit.find()
 
 
 def test_a_file_that_is_no_video_is_one_line(visit, tmp_path):

@@ -115,6 +115,31 @@ def test_cameras_turned_towards_each_other_lose_metres(painted):
     assert aligned.pair.camera is None
 
 
+@pytest.mark.parametrize(
+    ("left", "right"),
+    [
+        (turn(SIZE, (0, 0, 0)), rolling_shutter(SIZE, 4)),
+        (turn(SIZE, (0, 1, 0)), turn(SIZE, (0, -1, 1))),
+    ],
+    ids=["rolling shutter", "turned"],
+)
+def test_cameras_that_are_stated_to_be_parallel_keep_every_disparity(painted, left, right):
+    camera = StereoCamera.centred(painted.pair.left, focal_px=640, baseline_m=0.1)
+    taken = take(painted, left, right)
+    aligned = align(replace(taken.pair, camera=camera), parallel=True)
+    assert aligned.alignment.is_rectified
+    assert aligned.pair.camera == camera
+    left_px, right_px = (
+        warp.transform(places_px)
+        for warp, places_px in zip(aligned.warps, (taken.left_px, taken.right_px), strict=True)
+    )
+    np.testing.assert_allclose(left_px, taken.left_px, atol=1e-6)
+    np.testing.assert_allclose(right_px[:, 0], taken.right_px[:, 0], atol=1e-6)
+    assert [str(note).partition("; ")[2] for note in aligned.notes] == [
+        "rows were bent; keep the pictures as they are (no_rectify)"
+    ]
+
+
 def test_a_sound_pair_stays_as_it_is(example):
     aligned = align(example)
     assert aligned.pair is example

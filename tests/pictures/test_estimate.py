@@ -7,7 +7,7 @@ import pytest
 
 import stereoweave as sw
 from stereoweave.errors import StereoweaveError
-from stereoweave.io.images import read_pair
+from stereoweave.io.images import read_pair, write_image
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 DOWN_PX = 12
@@ -60,3 +60,28 @@ def test_a_sound_pair_gives_the_same_with_and_without_alignment(example):
 def test_another_kind_of_alignment_is_refused(example):
     with pytest.raises(StereoweaveError, match="^align: expected 'auto' or None, got 'always'"):
         sw.estimate(example.left, example.right, align="always")
+
+
+def test_one_file_with_both_views_is_a_pair(example, tmp_path):
+    both = tmp_path / "both.png"
+    write_image(both, np.hstack([example.left, example.right]))
+    found = sw.estimate(both)
+    np.testing.assert_array_equal(found.disparity_px, sw.estimate(example.left, example.right).disparity_px)
+    np.testing.assert_array_equal(found.pair.right, example.right)
+    assert found.pair.camera is None
+    assert [str(note).partition(",")[0] for note in found.notes] == ["side_by_side"]
+
+
+@pytest.mark.testdata
+def test_a_spatial_photo_alone_gives_metres(testdata):
+    found = sw.estimate(testdata / "consumer" / "vision-pro.HEIC", align="auto")
+    depth_m = found.pair.camera.depth_m(found.disparity_px)
+    # The yellow pillow in the middle: its pattern at column 1310 is 135 px farther left in the right picture,
+    # 1525.4 px * 63.774 mm / 135 px = 0.721 m.
+    assert np.median(depth_m[1340:1400, 1280:1340]) == pytest.approx(0.721, abs=0.01)
+
+
+@pytest.mark.usefixtures("without_shape_checks")
+def test_an_image_alone_is_no_pair(example):
+    with pytest.raises(StereoweaveError, match="expected a right image besides a left one that is no path"):
+        sw.estimate(example.left)

