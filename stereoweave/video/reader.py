@@ -173,7 +173,8 @@ def open_video(
         return StereoVideo(tracks, None)
     [track] = tracks
     if track.is_spatial:
-        _check_spatial(track, format)
+        check_unpacked(track.name, format)
+        _check_second_view(track)
         return StereoVideo(tracks, None)
     name = format or detect_layout(track.name, track.samples(), track.declared_packing)
     try:
@@ -182,14 +183,17 @@ def open_video(
         raise FormatError(f"{track.name}: {error}") from error
 
 
-def _check_spatial(track: Track, format: str | None) -> None:
-    """Raise an error if a frame packing is given for a spatial video, or if its second view is missing."""
+def check_unpacked(name: str, format: str | None) -> None:
+    """Raise StereoweaveError if a frame packing is given for a spatial video."""
     if format:
         raise StereoweaveError(
-            f"{track.name}: expected no frame packing for a spatial video (MV-HEVC), whose views are in two "
+            f"{name}: expected no frame packing for a spatial video (MV-HEVC), whose views are in two "
             f"layers, found {format}",
             remedy=Remedy("leave it out", ("format",)),
         )
+
+
+def _check_second_view(track: Track) -> None:
     if next(iter(track.shots(0)), None) is None:
         raise FormatError(
             f"{track.name}: expected both views of a spatial video (MV-HEVC), found no frame with a second "

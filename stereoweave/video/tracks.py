@@ -289,6 +289,14 @@ def open_track(path: Path, rate: Fraction | None) -> Track:
     return PictureTrack(str(path), files, rate or Fraction(25))
 
 
+def is_spatial_file(path: Path) -> bool:
+    """Return whether a file is a spatial video (MV-HEVC); False for a file that cannot be decoded."""
+    with suppress(StereoweaveError), _opening(path) as (container, stream):
+        first = next(_drop_corrupt(_decode(container, stream)), None)
+        return first is not None and is_spatial(first)
+    return False
+
+
 def list_picture_files(path: Path) -> list[Path] | None:
     """Return the pictures in a folder or matching a glob pattern, in natural order; None for other paths."""
     if path.is_dir():
