@@ -1,4 +1,4 @@
-"""Stereo videos in several containers and codecs."""
+"""Stereo videos in several containers and codecs, and a spatial one."""
 
 from fractions import Fraction
 from functools import partial
@@ -11,7 +11,7 @@ import numpy as np
 from fuzz.targets import Target, write_to_bytes
 from fuzz.targets.pictures import eyes
 from stereoweave.video.reader import open_video
-from stereoweave.video.tracks import open_track
+from stereoweave.video.tracks import is_spatial_file, open_track
 
 _FRAMES = 5
 _KINDS = {
@@ -20,11 +20,13 @@ _KINDS = {
     "ffv1_SBS.mkv": "ffv1",
     "mjpeg_SBS.avi": "mjpeg",
 }
+_SPATIAL = Path(__file__).resolve().parents[2] / "tests" / "spatial_video" / "pan.mp4"
 _PIXELS = {"ffv1": "bgr0", "mjpeg": "yuvj420p"}
 
 
 def _starts() -> dict[str, bytes]:
-    return {name: write_to_bytes(name, partial(_write, codec=codec)) for name, codec in _KINDS.items()}
+    written = {name: write_to_bytes(name, partial(_write, codec=codec)) for name, codec in _KINDS.items()}
+    return written | {_SPATIAL.name: _SPATIAL.read_bytes()}
 
 
 def _write(path: Path, codec: str) -> None:
@@ -43,7 +45,7 @@ def _write(path: Path, codec: str) -> None:
 
 def _read(path: Path) -> None:
     # Detection would take most of the time; the target for pictures covers it.
-    video = open_video([path], "side_by_side")
+    video = open_video([path], None if is_spatial_file(path) else "side_by_side")
     for _ in islice(video.frames(), 2 * _FRAMES):
         pass
     open_track(path, None).samples()
@@ -54,6 +56,7 @@ TARGET = Target(
     read=_read,
     tokens=(
         *b"moov mdat trak stts stsz stco ctts elst st3d sv3d avcC RIFF movi idx1 00dc LIST strf".split(),
+        *b"hvcC lhvC vexu eyes stri blin dadj hfov".split(),
         *(b"\0\0\1", b"\x1a\x45\xdf\xa3", b"\xa3", b"\x53\xb8", b"\xe7"),
     ),
 )

@@ -11,8 +11,10 @@ from typing import NamedTuple
 
 import cv2
 
-from stereoweave.errors import FormatError, StereoweaveError
+from stereoweave.app.spatial_capture import SpatialCapture
+from stereoweave.errors import FormatError, Note, StereoweaveError
 from stereoweave.pictures.pair_layouts import Picture
+from stereoweave.stereo import StereoCamera
 
 _DEFAULT_RATE = 25.0
 # A network stream may be slow; a camera that delivers no frame for this long is disconnected.
@@ -24,7 +26,7 @@ class Moment(NamedTuple):
 
     Attributes:
         number: Number of the moment, counted from 0.
-        pictures: One image per source.
+        pictures: One image per source; of a spatial video, the left and the right view.
         taken_s: Time of capture, as returned by `time.monotonic`.
     """
 
@@ -43,8 +45,15 @@ class Capture:
             file, a stream address, or a series of pictures such as frame%03d.png.
         loop: Begin a video file or a series of pictures again at its end. Cameras and streams have no end.
 
+    Attributes:
+        name: The sources, for messages.
+        count: Number of images of each moment.
+        is_spatial: Whether the source is a spatial video.
+        camera: Camera of the views, if a spatial video declares it.
+        notes: Notes on the source.
+
     Raises:
-        FormatError: If a source cannot be opened.
+        FormatError: If a source cannot be opened, or one of two is a spatial video.
         StereoweaveError: If there are more than two sources.
     """
 
@@ -58,10 +67,20 @@ class Capture:
         self._sources = sources
         self._captures = [_open_source(source) for source in sources]
         first = self._captures[0]
+        self.is_spatial = any(isinstance(capture, SpatialCapture) for capture in self._captures)
+        self.camera: StereoCamera | None = None
+        self.notes: Sequence[Note] = ()
+        if isinstance(first, SpatialCapture) and len(sources) == 1:
+            self.count, self.camera, self.notes = 2, first.camera, first.notes
+        elif self.is_spatial:
+            raise FormatError(
+                f"{self.name}: expected a left and a right video with one view each, found a spatial video "
+                "(MV-HEVC) with both views; give it alone"
+            )
         # A single picture or a recorded stream has no frame count.
-        self._is_recording = first.get(cv2.CAP_PROP_FRAME_COUNT) > 0 or Path(sources[0]).is_file()
+        self._is_recording = _count_frames(first) > 0 or Path(sources[0]).is_file()
         self._loop = loop and self._is_recording
-        rate = first.get(cv2.CAP_PROP_FPS)
+        rate = _measure_rate(first)
         self._step_s = 1 / (rate if rate > 0 else _DEFAULT_RATE)
         self._newest: Moment | None = None
         self._ended = False
@@ -132,13 +151,32 @@ class Capture:
         # Grab all images before decoding any, so that they are as close in time as possible.
         if not all([capture.grab() for capture in self._captures]):
             return None
-        frames = [capture.retrieve() for capture in self._captures]
-        if not all(well for well, _ in frames):
-            return None
-        return tuple(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB) for _, frame in frames)
+        pictures = [_retrieve(capture) for capture in self._captures]
+        return sum(pictures, ()) if all(pictures) else None
 
 
-def _open_source(source: str) -> cv2.VideoCapture:
+_Source = cv2.VideoCapture | SpatialCapture
+
+
+def _retrieve(capture: _Source) -> tuple[Picture, ...]:
+    """Return the images that were grabbed; none if they cannot be decoded."""
+    if isinstance(capture, SpatialCapture):
+        return capture.retrieve()
+    well, frame = capture.retrieve()
+    return (cv2.cvtColor(frame, cv2.COLOR_BGR2RGB),) if well else ()
+
+
+def _count_frames(capture: _Source) -> float:
+    return 1 if isinstance(capture, SpatialCapture) else capture.get(cv2.CAP_PROP_FRAME_COUNT)
+
+
+def _measure_rate(capture: _Source) -> float:
+    return capture.rate if isinstance(capture, SpatialCapture) else capture.get(cv2.CAP_PROP_FPS)
+
+
+def _open_source(source: str) -> _Source:
+    if spatial := SpatialCapture.open(source):
+        return spatial
     level = cv2.utils.logging.getLogLevel()
     # A failure is reported by the error below; OpenCV would also print a line about it.
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)

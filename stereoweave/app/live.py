@@ -3,7 +3,7 @@
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -20,6 +20,7 @@ from stereoweave.matching.matcher import Matcher
 from stereoweave.outputs.metres import format_metres
 from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS, Frame, Picture, detect_layout
 from stereoweave.stereo import StereoCamera, StereoPair
+from stereoweave.video.reader import check_unpacked
 
 # Fraction by which the colour range moves towards a new frame's range; at 1, colours would flicker.
 _RANGE_SHARE = 0.1
@@ -82,19 +83,26 @@ def show(  # noqa: PLR0913 - source, output and settings
         matcher: Matcher that estimates the disparity.
         tally: Statistics, updated with each frame so that they are valid even after an error.
         format: Frame packing of a single source, a name in `PAIR_LAYOUTS`. Default: detected.
-        rig: Calibration with which to rectify the images. Default: the images are already rectified.
+        rig: Calibration with which to rectify the images. Default: the images are already rectified, by the
+            camera that a spatial video declares.
         tell: Function that is called with each note on the sources, at the first frame.
+
+    Raises:
+        StereoweaveError: A frame packing is given for a spatial video.
     """
+    if capture.is_spatial:
+        check_unpacked(capture.name, format)
     range_px: tuple[float, float] | None = None
     while moment := capture.newest(tally.last):
         if capture.count == 1 and format is None:
             format = detect_layout(capture.name, moment.pictures)
-        if format and not tally.shown:
+        if not tally.shown:
             height_px, width_px = moment.pictures[0].shape[:2]
-            for note in PAIR_LAYOUTS[format].note_odd_size(width_px, height_px):
+            odd = PAIR_LAYOUTS[format].note_odd_size(width_px, height_px) if format else []
+            for note in [*capture.notes, *odd]:
                 tell(note)
         pair = _split_pair(moment.pictures, format)
-        pair = rectify(pair, rig).pair if rig else pair
+        pair = rectify(pair, rig).pair if rig else replace(pair, camera=capture.camera)
         disparity_px = match(matcher, pair).disparity_px
         range_px = follow_range(range_px, disparity_px)
         tally.add(moment, time.monotonic())

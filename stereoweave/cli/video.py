@@ -29,8 +29,8 @@ Videos = Annotated[
     list[Path],
     typer.Argument(
         metavar="VIDEO",
-        help="Stereo video with both views in each frame, or LEFT RIGHT. Each is a video file, a folder of "
-        "pictures, or a quoted pattern such as 'left/*.png'.",
+        help="Stereo video with both views in each frame, spatial video (MV-HEVC), or LEFT RIGHT. Each is a "
+        "video file, a folder of pictures, or a quoted pattern such as 'left/*.png'.",
     ),
 ]
 Out = Annotated[

@@ -97,7 +97,7 @@ def convert_video(
             part = islice(chain([first], frames), round(_PART_S * video.rate) or 1)
             with parts.next(converter.state) as path, closing(converter.convert(part)) as pictures:
                 recorder.write_part(path, map(meter.count, pictures))
-        recorder.join(parts.files, video.sound, out, job.describe_values(converter.survey))
+        recorder.join(parts.files, video.sound, out, job.describe_values(converter.survey, video.camera))
     return replace(converter.tally, frames_per_s=meter.frames_per_s)
 
 

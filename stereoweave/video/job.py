@@ -11,7 +11,7 @@ from stereoweave.io.colormap import colour_disparity
 from stereoweave.matching.backend import Backend
 from stereoweave.rendering.layouts import LAYOUTS, LayoutOptions, check_positions
 from stereoweave.rendering.renderer import Renderer
-from stereoweave.stereo import Estimate, StereoPair
+from stereoweave.stereo import Estimate, StereoCamera, StereoPair
 from stereoweave.video.survey import Survey
 from stereoweave.video.writer import Picture
 
@@ -129,18 +129,32 @@ class VideoJob:
         )
         return [Note(text, Remedy("show all of them in colours", ("depth",)))]
 
-    def describe_values(self, survey: Survey) -> dict[str, str]:
-        """Return metadata for the output file that explains how pixel values encode disparity."""
+    def describe_values(self, survey: Survey, camera: StereoCamera | None = None) -> dict[str, str]:
+        """Return metadata for the output file that explains how pixel values encode disparity.
+
+        With a camera, it also explains their depth in metres.
+        """
         low_px, high_px = survey.range_px
         if self.depth16:
-            return {"comment": f"16-bit grey: disparity of the left view in pixels = value / {_STEPS_PER_PX}"}
+            text = f"16-bit grey: disparity of the left view in pixels = value / {_STEPS_PER_PX}"
+            if camera:
+                constant = camera.focal_px * camera.baseline_m * _STEPS_PER_PX
+                text += f"; depth in metres = {constant:.6g} / value"
+            return {"comment": text}
         if self.depth:
-            return {
-                "comment": f"disparity of the left view: {low_px:.2f} px is blue, {high_px:.2f} px is red"
-            }
+            low, high = (_describe_disparity(value_px, camera) for value_px in survey.range_px)
+            return {"comment": f"disparity of the left view: {low} is blue, {high} is red"}
         if self.layout == "rgbd":
             return {"comment": f"disparity in grey: {low_px:.2f} px is black, {high_px:.2f} px is white"}
         return {}
+
+
+def _describe_disparity(disparity_px: float, camera: StereoCamera | None) -> str:
+    text = f"{disparity_px:.2f} px"
+    if camera is None:
+        return text
+    depth_m = float(camera.depth_m(np.array([[disparity_px]]))[0, 0])
+    return f"{text} ({depth_m:.3g} m)" if isfinite(depth_m) else f"{text} (infinity)"
 
 
 def _encode_grey16(disparity_px: Float[np.ndarray, "h w"]) -> UInt16[np.ndarray, "h w"]:

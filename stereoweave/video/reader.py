@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import UInt8
 
-from stereoweave.errors import FormatError, StereoweaveError
+from stereoweave.errors import FormatError, Remedy, StereoweaveError
 from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS, detect_layout
 from stereoweave.video.tracks import Shot, Track, open_track
 
@@ -43,28 +43,35 @@ class StereoVideo:
 
     Attributes:
         name: Paths of the files, as given by the caller.
-        frame_packing: Frame packing, a name in `PAIR_LAYOUTS`; None for two files.
+        frame_packing: Frame packing, a name in `PAIR_LAYOUTS`; None for two files, and for a spatial video.
         size_px: Width and height of each eye's image at full size.
         frame_count: Number of frames that `frames` yields, including damaged frames. For two files with
             different numbers of frames, this is the lower number.
         rate: Average frames per second.
         time_base: Time unit in seconds; every frame time is a multiple of this unit.
+        camera: Camera of the views as a spatial video declares it; None if it is unknown.
         sound: File that contains the sound; None for a silent video.
         excerpted: Name of the part of a longer video that this is, such as "1440+120" for 120 frames from
             frame 1440 on; None for a whole video.
-        notes: Note on the column or row that is dropped from frames of odd width or height.
+        notes: Notes on views and colours, and on the column or row that is dropped from frames of odd width
+            or height.
         on_frame: Function that `frames` calls with the number of each frame that it yields, to show progress.
     """
 
     def __init__(self, tracks: Sequence[Track], frame_packing: str | None) -> None:
-        """Combine a left and a right track, or split one track with both eyes in each frame."""
+        """Combine a left and a right track, or split one track with both eyes in each frame.
+
+        Without a frame packing, a single track must be spatial.
+        """
         self._tracks = tracks
         self._split = PAIR_LAYOUTS[frame_packing] if frame_packing else None
         first = tracks[0]
         self.name = ", ".join(track.name for track in tracks)
         self.frame_packing = frame_packing
         self.size_px = self._split.eye_size_px(*first.size_px) if self._split else first.size_px
-        self.notes = tuple(self._split.note_odd_size(*first.size_px)) if self._split else ()
+        odd = self._split.note_odd_size(*first.size_px) if self._split else []
+        self.notes = (*first.notes, *odd)
+        self.camera = first.camera
         self.frame_count = min(len(track.steps) for track in tracks)
         self.rate, self.time_base = first.rate, first.time_base
         self.sound = next((track.sound for track in tracks if track.sound), None)
@@ -105,7 +112,7 @@ class StereoVideo:
             *(_bridge_gaps(track, first + start, first) for track in self._tracks), strict=False
         )
         for index, seen in zip(range(first + start, first + self.frame_count), every_track, strict=False):
-            pictures = [shot.picture() for shot, _ in seen]
+            pictures = [picture for shot, _ in seen for picture in shot.pictures()]
             left, right = self._split.eyes(*pictures) if self._split else pictures
             time = (steps[index] - steps[first]) * self.time_base
             self.on_frame(index - first)
@@ -137,11 +144,12 @@ def open_video(
     """Open a stereo video from one file with both eyes, or from a left and a right file.
 
     Each file is read once to find the times of all frames, and some frames are decoded to detect the frame
-    packing.
+    packing. A spatial video (MV-HEVC) says itself which view is the left one.
 
     Args:
         paths: One or two videos, folders of pictures, or glob patterns that match pictures.
-        format: Frame packing of a single video, a name in `PAIR_LAYOUTS`. Default: detected.
+        format: Frame packing of a single video, a name in `PAIR_LAYOUTS`; none for a spatial video. Default:
+            detected.
         rate: Frame rate for pictures, in frames per second. Default: 25.
 
     Raises:
@@ -164,6 +172,10 @@ def open_video(
         _check_alike(*tracks)
         return StereoVideo(tracks, None)
     [track] = tracks
+    if track.is_spatial:
+        check_unpacked(track.name, format)
+        _check_second_view(track)
+        return StereoVideo(tracks, None)
     name = format or detect_layout(track.name, track.samples(), track.declared_packing)
     try:
         return StereoVideo(tracks, name)
@@ -171,8 +183,32 @@ def open_video(
         raise FormatError(f"{track.name}: {error}") from error
 
 
+def check_unpacked(name: str, format: str | None) -> None:
+    """Raise StereoweaveError if a frame packing is given for a spatial video."""
+    if format:
+        raise StereoweaveError(
+            f"{name}: expected no frame packing for a spatial video (MV-HEVC), whose views are in two "
+            f"layers, found {format}",
+            remedy=Remedy("leave it out", ("format",)),
+        )
+
+
+def _check_second_view(track: Track) -> None:
+    if next(iter(track.shots(0)), None) is None:
+        raise FormatError(
+            f"{track.name}: expected both views of a spatial video (MV-HEVC), found no frame with a second "
+            "view; export the video again"
+        )
+
+
 def _check_alike(left: Track, right: Track) -> None:
     """Raise FormatError unless both videos have the same size and stay in sync to within half a frame."""
+    for track in (left, right):
+        if track.is_spatial:
+            raise FormatError(
+                f"expected a left and a right video with one view each, found {track.name}, a spatial video "
+                "(MV-HEVC) with both views; give it alone"
+            )
     if left.size_px != right.size_px:
         sizes = ["{}x{}".format(*track.size_px) for track in (left, right)]
         raise FormatError(

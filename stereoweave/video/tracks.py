@@ -9,29 +9,24 @@ from fractions import Fraction
 from functools import partial
 from itertools import count, dropwhile, islice, pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import UInt8
 
-from stereoweave.errors import FormatError, Remedy, StereoweaveError, require_extra
+from stereoweave.errors import FormatError, Note, Remedy, StereoweaveError, require_extra
 from stereoweave.io.decoding import ENDINGS
 from stereoweave.io.images import read_image
+from stereoweave.stereo import StereoCamera
+from stereoweave.video.colours import convert_to_rgb, name_hdr
+from stereoweave.video.spatial import Stereo3D, ViewPair, is_spatial, pair_views, read_stereo3d
 
 if TYPE_CHECKING:
     import av
 
 _SAMPLES = 0.1, 0.3, 0.5, 0.7, 0.9
 
-# As in players such as mpv, untagged colours are BT.709 from this width or height upwards, and BT.601 below.
-_HD_WIDTH_PX, _HD_HEIGHT_PX = 1280, 577
-_BT709, _BT601, _FULL_RANGE = 1, 5, 2  # av.video.reformatter's Colorspace and ColorRange
-_UNTAGGED = 0, 2  # AVCOL_SPC_RGB, which some encoders write for "unknown", and AVCOL_SPC_UNSPECIFIED
-
-# FFmpeg's AV_FRAME_DATA_VIEW_ID.
-_VIEW_ID = 29
-# AVStereo3D begins with its type and its flags. The type is one of these, 0 (not stereo) or 8 (unknown). The
-# lowest flag means that the right eye comes first.
+# AVStereo3DType is one of these, 0 (not stereo) or 8 (unknown).
 _STEREO_3D = {
     1: "side_by_side",
     2: "top_bottom",
@@ -48,19 +43,21 @@ _MP4_BOXES = b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot"
 # A file counts as cut off if it ends before its declared duration by more than this.
 _CUT_OFF_S = Fraction(1, 5)
 
+Decoded = TypeVar("Decoded", "av.VideoFrame", ViewPair)
+
 
 class Shot(NamedTuple):
     """Decoded frame.
 
     Attributes:
         number: Index of the frame in the track.
-        picture: Function that converts the frame to uint8 RGB [H, W, 3]. It is called only for needed
-            frames.
+        pictures: Function that converts the frame to uint8 RGB [H, W, 3]; of a spatial video, to the left and
+            the right view. It is called only for needed frames.
         is_key_frame: Whether the frame can be decoded without any earlier frame.
     """
 
     number: int
-    picture: Callable[[], UInt8[np.ndarray, "h w 3"]]
+    pictures: Callable[[], Sequence[UInt8[np.ndarray, "h w 3"]]]
     is_key_frame: bool
 
 
@@ -76,7 +73,10 @@ class VideoTrack:
         rate: Average frames per second.
         size_px: Width and height of a whole frame after the rotation that players apply.
         declared_packing: Frame packing declared in the file, either a full-size packing in `PAIR_LAYOUTS` or
-            an unsupported packing; None if the file declares no packing.
+            an unsupported packing; None if the file declares no packing, or is a spatial video.
+        is_spatial: Whether the video is a spatial one (MV-HEVC), with each view in a layer of its own.
+        camera: Camera of the views of a spatial video, if the file declares it.
+        notes: Notes on views and colours.
         sound: Path of the file if it has sound, else None.
         truncation: Message about a file that ends early; None for a complete file.
 
@@ -94,9 +94,20 @@ class VideoTrack:
             first = next(_drop_corrupt(_decode(container, stream)), None)
             if first is None:
                 raise FormatError(f"{path}: expected a video, found a file without a decodable frame")
-            self._frame_size_px = first.width, first.height
-            self.size_px = self._frame_size_px if first.rotation % 180 == 0 else self._frame_size_px[::-1]
-            self.declared_packing = _read_declared_packing(path, first)
+            self._describe(first)
+
+    def _describe(self, first: "av.VideoFrame") -> None:
+        """Set what the first frame says about all frames."""
+        self._frame_size_px = first.width, first.height
+        self.size_px = self._frame_size_px if first.rotation % 180 == 0 else self._frame_size_px[::-1]
+        self.is_spatial = is_spatial(first)
+        declared = read_stereo3d(first) or Stereo3D()
+        self._right_first = declared.is_right_first
+        self.declared_packing = None if self.is_spatial else _name_packing(declared)
+        self.camera = declared.camera(self._frame_size_px) if self.is_spatial else None
+        self.notes = [declared.note()] if self.is_spatial else []
+        if hdr := name_hdr(first):
+            self.notes.append(Note(f"the video is HDR ({hdr}); it is tone-mapped to SDR (BT.709)"))
 
     def shots(self, start: int, first: int = 0) -> Iterator[Shot]:
         """Yield the frames that can be decoded, in display order, from a key frame at or before `first` on.
@@ -135,15 +146,25 @@ class VideoTrack:
     def _read_shots(
         self, container: "av.container.InputContainer", stream: "av.VideoStream"
     ) -> Iterator[Shot]:
-        frames = _decode(container, stream)
+        decoded: Iterator[Any] = _decode(container, stream)
+        moments = pair_views(decoded) if self.is_spatial else decoded
         placed = (
-            _number_by_rank(frames, stream)
+            _number_by_rank(moments, stream)
             if self._stamps is None
-            else _number_by_stamp(frames, self._stamps)
+            else _number_by_stamp(moments, self._stamps)
         )
-        for index, frame in placed:
-            if not frame.is_corrupt and (frame.width, frame.height) == self._frame_size_px:
-                yield Shot(index, partial(_convert_to_rgb, frame), frame.key_frame)
+        for index, moment in placed:
+            views = self._order_views(moment)
+            if all(
+                not view.is_corrupt and (view.width, view.height) == self._frame_size_px for view in views
+            ):
+                yield Shot(index, partial(_convert_all, views), moment.key_frame)
+
+    def _order_views(self, moment: "av.VideoFrame | ViewPair") -> Sequence["av.VideoFrame"]:
+        """Return one frame, or the left and the right view of a spatial video."""
+        if not isinstance(moment, ViewPair):
+            return (moment,)
+        return (moment.other, moment.base) if self._right_first else (moment.base, moment.other)
 
     def samples(self) -> list[UInt8[np.ndarray, "h w 3"]]:
         """Return one or more images from different parts of the video."""
@@ -151,11 +172,11 @@ class VideoTrack:
 
         pictures: list[UInt8[np.ndarray, "h w 3"]] = []
         with _opening(self._path) as (container, stream):
-            pictures += map(_convert_to_rgb, islice(_drop_corrupt(_decode(container, stream)), 1))
+            pictures += map(convert_to_rgb, islice(_drop_corrupt(_decode(container, stream)), 1))
             for share in _SAMPLES:
                 with suppress(av.error.FFmpegError):
                     container.seek(int(share * (container.duration or 0)))
-                    pictures += map(_convert_to_rgb, islice(_drop_corrupt(_decode(container, stream)), 1))
+                    pictures += map(convert_to_rgb, islice(_drop_corrupt(_decode(container, stream)), 1))
         return pictures
 
     def _read_times(self, container: "av.container.InputContainer", stream: "av.VideoStream") -> None:
@@ -187,6 +208,9 @@ class PictureTrack:
     """
 
     declared_packing: str | None = None
+    is_spatial = False
+    camera: StereoCamera | None = None
+    notes: Sequence[Note] = ()
     retimed: Collection[int] = ()
     sound: Path | None = None
     truncation: str | None = None
@@ -210,7 +234,8 @@ class PictureTrack:
     def samples(self) -> list[UInt8[np.ndarray, "h w 3"]]:
         """Return one or more images from different parts of the series."""
         starts = [int(share * len(self._files)) for share in (0.0, *_SAMPLES)]
-        return [shot.picture() for start in starts for shot in islice(self.shots(start), 1)]
+        shots = [shot for start in starts for shot in islice(self.shots(start), 1)]
+        return [picture for shot in shots for picture in shot.pictures()]
 
     def _read_first(self) -> UInt8[np.ndarray, "h w 3"]:
         """Return the first picture that can be read."""
@@ -224,7 +249,7 @@ class PictureTrack:
 
     def _read_shot(self, index: int) -> Shot | None:
         picture = self._read_picture(index)
-        return None if picture is None else Shot(index, lambda: picture, is_key_frame=True)
+        return None if picture is None else Shot(index, lambda: [picture], is_key_frame=True)
 
     def _read_picture(self, index: int) -> UInt8[np.ndarray, "h w 3"] | None:
         with suppress(FormatError):
@@ -264,6 +289,14 @@ def open_track(path: Path, rate: Fraction | None) -> Track:
     return PictureTrack(str(path), files, rate or Fraction(25))
 
 
+def is_spatial_file(path: Path) -> bool:
+    """Return whether a file is a spatial video (MV-HEVC); False for a file that cannot be decoded."""
+    with suppress(StereoweaveError), _opening(path) as (container, stream):
+        first = next(_drop_corrupt(_decode(container, stream)), None)
+        return first is not None and is_spatial(first)
+    return False
+
+
 def list_picture_files(path: Path) -> list[Path] | None:
     """Return the pictures in a folder or matching a glob pattern, in natural order; None for other paths."""
     if path.is_dir():
@@ -290,6 +323,8 @@ def _opening(path: Path) -> Iterator[tuple["av.container.InputContainer", "av.Vi
         # With several threads, FFmpeg conceals damage in H.264 poorly, if at all, and not reproducibly.
         stream.codec_context.thread_count = 1
         stream.codec_context.copy_opaque = True  # passes the packet's rank on to the frame
+        if stream.codec_context.name == "hevc":
+            stream.codec_context.options = {"view_ids": "-1"}  # both views of a spatial video
         if stream.codec_context.name == "mjpeg":
             # By default, the decoder returns truncated pictures, grey at the bottom, as if they were intact.
             stream.codec_context.options = {"err_detect": "explode"}
@@ -370,9 +405,7 @@ def _separate_duplicates(stamps: Sequence[int], frame_steps: int) -> tuple["arra
     return steps, retimed
 
 
-def _number_by_stamp(
-    frames: Iterator["av.VideoFrame"], stamps: Sequence[int]
-) -> Iterator[tuple[int, "av.VideoFrame"]]:
+def _number_by_stamp(frames: Iterator[Decoded], stamps: Sequence[int]) -> Iterator[tuple[int, Decoded]]:
     """Yield each frame with its index, found by timestamp. Frames with equal timestamps keep their order."""
     last = -1
     for frame in frames:
@@ -383,9 +416,7 @@ def _number_by_stamp(
             last = index
 
 
-def _number_by_rank(
-    frames: Iterator["av.VideoFrame"], stream: "av.VideoStream"
-) -> Iterator[tuple[int, "av.VideoFrame"]]:
+def _number_by_rank(frames: Iterator[Decoded], stream: "av.VideoStream") -> Iterator[tuple[int, Decoded]]:
     """Yield each frame with its index, found by the position of its packet among all packets.
 
     Without B-frames, a lost frame is noticed at the next frame; with B-frames, only at the next key frame.
@@ -419,40 +450,14 @@ def _describe_error(error: "av.error.FFmpegError") -> str:
     return (error.strerror or "error in FFmpeg").lower()
 
 
-def _convert_to_rgb(frame: "av.VideoFrame") -> UInt8[np.ndarray, "h w 3"]:
-    from av.video.reformatter import Interpolation
-
-    large = frame.width >= _HD_WIDTH_PX or frame.height >= _HD_HEIGHT_PX
-    picture = frame.to_ndarray(
-        format="rgb24",
-        src_colorspace=(_BT709 if large else _BT601) if frame.colorspace in _UNTAGGED else None,
-        dst_color_range=_FULL_RANGE,
-        # Without the last two flags, FFmpeg's fast path from 4:2:0 darkens images by over one level of 255.
-        interpolation=Interpolation.BILINEAR | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT,
-        threads=1,
-    )
-    return np.ascontiguousarray(np.rot90(picture, frame.rotation // 90))
+def _convert_all(views: Sequence["av.VideoFrame"]) -> list[UInt8[np.ndarray, "h w 3"]]:
+    return [convert_to_rgb(view) for view in views]
 
 
-def _read_declared_packing(path: Path, frame: "av.VideoFrame") -> str | None:
-    from av.sidedata.sidedata import Type
-
-    # The type stubs of PyAV lack some kinds of side data.
-    try:
-        side_data: Any = frame.side_data
-    except ValueError as error:  # a kind of side data that PyAV does not know
-        if str(error).startswith(f"{_VIEW_ID} "):
-            raise FormatError(
-                f"{path}: expected both views in each frame, or two files, found a video with one view per "
-                "layer (MV-HEVC, as in Apple's spatial videos); convert it to side by side first"
-            ) from error
-        return None
-    if Type.STEREO3D not in side_data:
-        return None
-    kind, flags = np.frombuffer(bytes(side_data[Type.STEREO3D]), np.int32, 2)
-    name = _STEREO_3D.get(int(kind))
+def _name_packing(declared: Stereo3D) -> str | None:
+    name = _STEREO_3D.get(declared.kind)
     right_first = {None: None, "side_by_side": "crossed"}
-    return right_first.get(name, f"{name}_right_first") if flags & 1 else name
+    return right_first.get(name, f"{name}_right_first") if declared.is_inverted else name
 
 
 def _choose_rate(steps: Sequence[int], time_base: Fraction, average: Fraction) -> Fraction:

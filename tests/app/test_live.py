@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from browsers import chromium
+from spatial_examples import SPATIAL, psnr_db, spatial_pairs
 
 from stereoweave.app.capture import Capture
 from stereoweave.app.live import LiveTally, compose, describe_middle, follow_range, label_values, show
@@ -360,6 +361,45 @@ def test_two_videos_are_shown_as_the_left_image_and_its_disparity(tmp_path):
     top, bottom = picture[42:72, 340:620].mean((0, 1)), picture[242:272, 340:620].mean((0, 1))
     assert top[2] > top[0]
     assert bottom[0] > bottom[2]
+
+
+def test_a_spatial_video_is_shown_with_metres_and_a_note(monkeypatch):
+    told, tally, pictures = [], LiveTally(), []
+    with Screen(0) as screen, Capture([str(SPATIAL)]) as capture:
+        monkeypatch.setattr(screen, "show", pictures.append)
+        composed = []
+        monkeypatch.setattr(
+            "stereoweave.app.live.compose", lambda pair, *more: composed.append(pair) or compose(pair, *more)
+        )
+        show(capture, screen, Matcher(), tally, tell=told.append)
+    assert tally.shown == len(pictures) == len(composed) > 0
+    assert tally.last == 49
+    assert [str(note)[:43] for note in told] == ["spatial video (MV-HEVC), left view first: f"]
+    left, right = spatial_pairs()[-1]
+    assert psnr_db(composed[-1].left, left) > 35
+    assert psnr_db(composed[-1].right, right) > 35
+    # 160 * sqrt(3) px * 0.0635 m is 17.6 px m: 10 px are 1.76 m.
+    assert label_values(composed[-1].camera, [10.0]) == ["1.76 m"]
+
+
+def test_a_spatial_video_begins_again_with_loop():
+    with Capture([str(SPATIAL)], loop=True) as capture:
+        first = capture.newest(49)
+    assert first.number > 49
+    assert [picture.shape for picture in first.pictures] == 2 * [(192, 320, 3)]
+
+
+def test_a_spatial_video_with_another_one_or_a_frame_packing_is_refused(tmp_path):
+    plain = write_video(tmp_path / "video.avi", greys(3))
+    for sources in ([plain, str(SPATIAL)], [str(SPATIAL), plain]):
+        with pytest.raises(FormatError, match="with both views; give it alone"):
+            Capture(sources)
+    with (
+        Screen(0) as screen,
+        Capture([str(SPATIAL)]) as capture,
+        pytest.raises(StereoweaveError, match="found crossed; leave it out"),
+    ):
+        show(capture, screen, Matcher(), LiveTally(), format="crossed")
 
 
 def test_the_command_shows_a_video_and_keeps_its_last_picture(tmp_path):

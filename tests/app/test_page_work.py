@@ -4,6 +4,7 @@ import io
 import re
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import av
@@ -16,12 +17,13 @@ from page_examples import start, stop
 from page_visits import Visit, visiting
 from PIL import Image
 from playwright.sync_api import Browser
+from spatial_examples import SPATIAL
 from video_examples import example_pairs, packed, write_video
 
 from stereoweave.app.stereo_pictures import AUTOMATIC_PX, FULL_PX, KINDS, Wish, write_stereo_picture
 from stereoweave.app.video_tab import label_of
 from stereoweave.app.video_upload import VideoUpload, convert_upload
-from stereoweave.errors import FormatError
+from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io.images import read_image, write_image
 from stereoweave.matching.backend import Backend
 from stereoweave.matching.options import MatchOptions
@@ -388,6 +390,15 @@ def test_a_video_s_frames_and_the_time_left_are_reported(tmp_path):
         r"4 frames of 160×96 px, 0.2 s.*The whole video takes about \d+ (s|min|h)\.", made.summary
     )
     assert made.warnings == []
+
+
+def test_a_spatial_video_is_converted_with_a_note(tmp_path):
+    wish = replace(ask(SPATIAL, start_s=0.5), format=None)
+    made = convert_upload(wish, tmp_path, lambda share, what: None)
+    assert "320×192 px" in made.summary
+    assert [line[:38] for line in made.warnings] == ["spatial video (MV-HEVC), left view fir"]
+    with pytest.raises(StereoweaveError, match="found side_by_side; leave it out"):
+        convert_upload(ask(SPATIAL, start_s=None), tmp_path, lambda share, what: None)
 
 
 @pytest.mark.parametrize("ending", ["m3u8", "mp4", "ffconcat"])

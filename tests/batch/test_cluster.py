@@ -17,6 +17,7 @@ import numpy as np
 import pyarrow.dataset
 import pytest
 from other_processes import halted, list_processes
+from spatial_examples import SPATIAL
 from video_examples import example_pairs, packets, write_side_by_side
 
 from stereoweave.batch import worker as cluster_worker
@@ -364,6 +365,17 @@ def test_a_video_is_processed_after_parts_of_another_video_are_removed(tmp_path)
     assert (row["files"], row["error"], row["width_px"]) == ([FILM], None, 160)
     assert len(packets(tmp_path / "out" / "sea.mkv" / FILM, "video")) == 3
     assert not parts.exists()
+
+
+def test_a_spatial_video_is_processed(tmp_path):
+    (tmp_path / "films").mkdir()
+    shutil.copy(SPATIAL, tmp_path / "films")
+    source, out = store_at(tmp_path / "films"), store_at(tmp_path / "out")
+    [chunk] = extend_plan(source, out, workers=1).chunks
+    assert ChunkWorker(source, out, JOB)([chunk]).made == 1
+    [row] = read_rows(out, chunk).values()
+    assert (row["files"], row["error"], row["width_px"]) == ([FILM], None, 320)
+    assert len(packets(tmp_path / "out" / SPATIAL.name / FILM, "video")) == 50
 
 
 def test_a_video_in_use_by_another_process_becomes_an_error_row_and_keeps_its_parts(tmp_path):

@@ -1,6 +1,7 @@
 """Conversion of videos with the command: frames, times, sound, and resuming after an interruption."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -14,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 from other_processes import halted
+from spatial_examples import SPATIAL, spatial_pairs
 from video_examples import TEXTURED, damage, example_pairs, packets, write_side_by_side, write_video
 
 from stereoweave.cli.root import main
@@ -91,6 +93,37 @@ def test_depth_in_16_bits_is_disparity_times_256(tmp_path):
         grey = next(container.decode(video=0)).to_ndarray()
     # The first frame has no predecessor, so the temporal filter leaves it unchanged.
     np.testing.assert_array_equal(grey, np.rint(256 * estimate_of(first).disparity_px))
+
+
+def test_a_spatial_video_is_converted_with_its_times_sound_and_metres(tmp_path, capsys):
+    assert run(SPATIAL, tmp_path / "out.mkv", "--depth16", "--threads", "2") == 0
+    said = capsys.readouterr()
+    assert said.out == f"{tmp_path / 'out.mkv'}: 50 frames, 0 cuts\n"
+    assert "spatial video (MV-HEVC), left view first: field of view 60 degrees" in said.err
+    assert times_of(tmp_path / "out.mkv") == [Fraction(index, 25) for index in range(50)]
+    assert [body for _, body in packets(tmp_path / "out.mkv", "audio")] == [
+        body for _, body in packets(SPATIAL, "audio")
+    ]
+    with av.open(str(tmp_path / "out.mkv")) as container:
+        comment = container.metadata["COMMENT"]
+        grey = next(container.decode(video=0)).to_ndarray()
+    # 160 * sqrt(3) px * 0.0635 m * 256 = 4504.99
+    assert comment.endswith("in pixels = value / 256; depth in metres = 4504.99 / value")
+    left, right = spatial_pairs()[0]
+    expected_px = Matcher("small", threads=1).estimate(left, right).disparity_px
+    assert np.median(np.abs(grey / 256 - expected_px)) < 0.2
+
+
+def test_the_colours_of_a_spatial_video_are_explained_in_metres(tmp_path):
+    assert run(SPATIAL, tmp_path / "out.mp4", "--depth", "--preview", "0.2s") == 0
+    with av.open(str(tmp_path / "out.mp4")) as container:
+        comment = container.metadata["comment"]
+    low_px, low_m, high_px, high_m = (float(word) for word in re.findall(r"(\d[\d.]*) (?:px|m)\b", comment))
+    constant = 160 * 3**0.5 * 0.0635
+    assert [low_m, high_m] == pytest.approx([constant / low_px, constant / high_px], rel=0.01)
+    assert re.sub(r"\d[\d.]*", "N", comment) == (
+        "disparity of the left view: N px (N m) is blue, N px (N m) is red"
+    )
 
 
 def test_steps_that_overlap_give_the_same_frames(tmp_path):

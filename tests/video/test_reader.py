@@ -524,12 +524,6 @@ def test_an_excerpt_ends_with_its_video(tmp_path):
         video.excerpt(0.4, 5)
 
 
-@pytest.mark.testdata
-def test_a_spatial_video_is_refused_by_name(testdata):
-    said = refusal(testdata / "consumer" / "stereo_spatial.mp4")
-    assert "found a video with one view per layer (MV-HEVC, as in Apple's spatial videos); convert it" in said
-
-
 def test_each_frame_that_is_read_is_counted(tmp_path):
     path = write_side_by_side(tmp_path / "video.mkv", flat_pairs(6))
     video, read = open_video([path], "side_by_side"), []

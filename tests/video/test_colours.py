@@ -1,0 +1,128 @@
+from fractions import Fraction
+
+import av
+import numpy as np
+import pytest
+from video_examples import example_pairs, packed
+
+from stereoweave.video.colours import convert_to_rgb
+from stereoweave.video.reader import open_video
+
+PQ, HLG, BT2020, BT709 = 16, 18, 9, 1
+
+
+def nit_codes(*rgb_nits):
+    """Return the PQ codes of three luminances (SMPTE ST 2084)."""
+    power = (np.array(rgb_nits) / 10_000) ** (2610 / 16384)
+    return ((3424 / 4096 + 2413 / 128 * power) / (1 + 2392 / 128 * power)) ** (2523 / 32)
+
+
+def hdr_frame(rgb_codes, transfer, primaries=BT2020):
+    """Return a plain frame of non-linear RGB 0..1, as 10-bit YUV of BT.2020 in limited range."""
+    red, green, blue = rgb_codes
+    luma = 0.2627 * red + 0.6780 * green + 0.0593 * blue
+    codes = 64 + 876 * luma, 512 + 896 * (blue - luma) / 1.8814, 512 + 896 * (red - luma) / 1.4746
+    frame = av.VideoFrame(32, 16, "yuv444p10le")
+    for plane, code in zip(frame.planes, codes, strict=True):
+        plane.update(np.full(plane.buffer_size // 2, round(code), np.uint16).tobytes())
+    frame.colorspace, frame.color_range = BT2020, 1
+    frame.color_trc, frame.color_primaries = transfer, primaries
+    return frame
+
+
+def shown(rgb_codes, transfer, primaries=BT2020):
+    picture = convert_to_rgb(hdr_frame(rgb_codes, transfer, primaries))
+    assert picture.dtype == np.uint8
+    assert picture.shape == (16, 32, 3)
+    assert (picture == picture[0, 0]).all()
+    return picture[0, 0].astype(int).tolist()
+
+
+def srgb(light):
+    return round(255 * (1.055 * light ** (1 / 2.4) - 0.055))
+
+
+@pytest.mark.parametrize("nits", [5, 26, 58, 90])
+def test_luminance_below_the_knee_of_bt2390_is_kept(nits):
+    # The knee is at 1.5 * 0.581 - 0.5 * 0.752 = 0.495 in PQ, 92 cd/m2; SDR's white is 203.
+    assert shown(nit_codes(nits, nits, nits), PQ) == pytest.approx(3 * [srgb(nits / 203)], abs=1)
+
+
+def test_highlights_are_compressed_up_to_1000_nits():
+    greys = [shown(nit_codes(nits, nits, nits), PQ)[1] for nits in (90, 203, 400, 700, 1000, 4000)]
+    assert greys == sorted(greys)
+    assert greys[-2:] == [255, 255]
+    # By hand, by the spline of BT.2390: 203 cd/m2 is PQ 0.5807, a share of 0.7724 of the range to 1000 cd/m2;
+    # with the knee at 0.6586, t = 0.3333, so the share becomes 0.6586 * 0.7408 + 0.3414 * 0.1482 +
+    # 0.7724 * 0.2592 = 0.7387, PQ 0.5554, 159 cd/m2: 0.784 of SDR's white.
+    assert greys[1] == pytest.approx(srgb(0.784), abs=1)
+
+
+def test_hlg_and_pq_show_the_same_white_and_grey_card():
+    # BT.2408: white at 203 cd/m2 is 75 % HLG, the grey card at 26 cd/m2 is 38 %.
+    assert shown((0.75, 0.75, 0.75), HLG) == pytest.approx(shown(nit_codes(203, 203, 203), PQ), abs=1)
+    assert shown((0.38, 0.38, 0.38), HLG) == pytest.approx(shown(nit_codes(26, 26, 26), PQ), abs=2)
+    assert shown((0, 0, 0), HLG) == [0, 0, 0]
+    assert shown((1, 1, 1), HLG) == [255, 255, 255]
+
+
+@pytest.mark.parametrize(
+    ("channel", "column"), [(0, (0.6274, 0.0691, 0.0164)), (2, (0.0433, 0.0114, 0.8956))]
+)
+def test_primaries_of_bt709_stay_pure(channel, column):
+    # The columns are BT.709's red and blue in BT.2020 (BT.2087), here at 80 cd/m2.
+    expected = [0, 0, 0]
+    expected[channel] = srgb(80 / 203)
+    assert shown(nit_codes(*(80 * share for share in column)), PQ) == pytest.approx(expected, abs=4)
+
+
+def test_hdr_with_the_primaries_of_bt709_keeps_them():
+    red, green, blue = shown(nit_codes(80, 20, 20), PQ, primaries=BT709)
+    assert [red, green, blue] == pytest.approx([srgb(80 / 203), srgb(20 / 203), srgb(20 / 203)], abs=1)
+
+
+def write_ten_bits(path, codec, pairs, transfer, *, colorspace):
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=25)
+        stream.height, stream.width = packed(*pairs[0]).shape[:2]
+        stream.pix_fmt, context = "yuv420p10le", stream.codec_context
+        context.colorspace, context.color_range = colorspace, 1
+        context.color_trc, context.color_primaries = transfer, colorspace
+        context.options = {"crf": "8", "preset": "fast", "x265-params": "log-level=none"}
+        for index, pair in enumerate(pairs):
+            frame = av.VideoFrame.from_ndarray(packed(*pair), "rgb24").reformat(
+                format="yuv420p10le", src_color_range=2, dst_colorspace=colorspace, dst_color_range=1
+            )
+            frame.pts, frame.time_base = index, Fraction(1, 25)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    return path
+
+
+@pytest.mark.parametrize(("codec", "transfer", "name"), [("libx265", HLG, "HLG"), ("libx264", PQ, "PQ")])
+def test_an_hdr_video_is_tone_mapped_with_a_note(tmp_path, codec, transfer, name):
+    # Greys from black to white, which are taken as codes of HDR.
+    codes = np.tile(np.repeat(np.arange(0, 256, 8), 8), (96, 1)).astype(np.uint8)
+    ramp = np.stack([codes] * 3, axis=2)
+    path = write_ten_bits(tmp_path / "hdr.mp4", codec, 3 * [(ramp, ramp)], transfer, colorspace=BT2020)
+    video = open_video([path], "side_by_side")
+    assert [str(note) for note in video.notes] == [
+        f"the video is HDR ({name}); it is tone-mapped to SDR (BT.709)"
+    ]
+    expected = [shown(3 * (code / 255,), transfer)[1] for code in range(0, 256, 8)]
+    for frame in video.frames():
+        for eye in (frame.left, frame.right):
+            middles = eye[10:-10, 4::8].mean(axis=(0, 2))
+            np.testing.assert_allclose(middles[1:-1], expected[1:-1], atol=3)
+
+
+@pytest.mark.parametrize("codec", ["libx265", "libx264"])
+def test_ten_bits_without_hdr_are_read_as_eight(tmp_path, codec):
+    pairs = example_pairs(3)
+    path = write_ten_bits(tmp_path / "sdr.mp4", codec, pairs, BT709, colorspace=BT709)
+    video = open_video([path], "side_by_side")
+    assert video.notes == ()
+    for frame, (left, right) in zip(video.frames(), pairs, strict=True):
+        assert np.abs(frame.left.astype(float) - left).mean() < 2.5
+        assert np.abs(frame.right.astype(float) - right).mean() < 2.5
+        assert np.abs((frame.left.astype(float) - left).mean(axis=(0, 1))).max() < 0.5
