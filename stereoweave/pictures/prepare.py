@@ -4,9 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from stereoweave.cameras.alignment import RECTIFY, Alignment
+from stereoweave.cameras.alignment import RECTIFY, Alignment, check_pair
 from stereoweave.cameras.auto_align import align
 from stereoweave.cameras.calibration_files import read_rig
+from stereoweave.cameras.diagnosis import GIVE_DOFFS
 from stereoweave.cameras.rectify import Rectified, rectify
 from stereoweave.cameras.rig import pair_size_px
 from stereoweave.errors import Note, Remedy, StereoweaveError
@@ -65,8 +66,8 @@ def prepare(pictures: Sequence[Path], request: Request) -> Prepared:
     """Open a pair from two pictures (left first) or one picture with both views; rectify it if needed.
 
     The camera comes from the calibration, from the request, or from EXIF. The pair has no camera if the
-    focal length or the baseline is unknown, or if rectification from feature matches did not find the cameras
-    parallel.
+    focal length or the baseline is unknown, if rectification from feature matches did not find the cameras
+    parallel, or if the camera is from EXIF, which lacks doffs, and many disparities are negative.
 
     Raises:
         StereoweaveError: See `open_pictures`, `read_rig`, `rectify` and `rectify_by_features`; or the request
@@ -84,13 +85,16 @@ def prepare(pictures: Sequence[Path], request: Request) -> Prepared:
     camera, notes = _find_camera(opened.pair, opened.lens or Lens(), request)
     pair = replace(opened.pair, camera=camera)
     in_metres = request.focal_px is not None or request.baseline_m is not None
-    found = _align(pair, False if in_metres and request.rectify is None else request.rectify)
+    rectified = False if in_metres and request.rectify is None else request.rectify
+    found = _align(pair, rectified)
+    if not in_metres:
+        found = _drop_camera_without_doffs(found)
     return Prepared(
         pair=found.pair,
         pictures=tuple(pictures),
         notes=(*opened.notes, *notes, *found.notes),
         alignment=found.alignment,
-        remedy=CALIBRATE if found.alignment else RECTIFY,
+        remedy=RECTIFY if rectified is False else CALIBRATE,
     )
 
 
@@ -156,3 +160,22 @@ def _align(pair: StereoPair, rectified: bool | None) -> _Ready:
         CALIBRATE,
     )
     return replace(ready, notes=(*ready.notes, lost))
+
+
+def _drop_camera_without_doffs(ready: _Ready) -> _Ready:
+    """Drop a camera whose doffs are unknown if many disparities are negative: its depths would be wrong."""
+    pair = ready.pair
+    if pair.camera is None:
+        return ready
+    alignment = ready.alignment or check_pair(pair.left, pair.right)
+    if not alignment.needs_doffs:
+        return replace(ready, alignment=alignment)
+    text = (
+        f"no depth in metres: {alignment.negative_percent:.0f} % of the matches have negative disparities, "
+        "as from converged cameras, whose doffs are not in EXIF"
+    )
+    return _Ready(
+        pair=replace(pair, camera=None),
+        notes=(*ready.notes, Note(text, GIVE_DOFFS)),
+        alignment=alignment,
+    )
