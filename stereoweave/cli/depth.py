@@ -37,9 +37,9 @@ Write = Annotated[
     list[str] | None,
     typer.Option(
         metavar="NAME",
-        help="Additional file to write: disparity.npy, disparity.tiff or disparity_scaled.png; in metres, if "
-        "the camera is known, depth.pfm, depth.npy, depth.tiff, cloud.ply, cloud.glb, mesh.ply or mesh.glb; "
-        "or all. Repeatable.",
+        help="Additional file to write: disparity.npy, disparity.tiff, disparity_scaled.png or "
+        "matched_left.png; in metres, if the camera is known, depth.pfm, depth.npy, depth.tiff, cloud.ply, "
+        "cloud.glb, mesh.ply or mesh.glb; or all. Repeatable.",
     ),
 ]
 PicturesOrFolder = Annotated[

@@ -51,7 +51,8 @@ class Prepared:
     """A pair ready for matching, its picture files, and notes on what was detected or changed.
 
     `alignment` is the alignment of the pair, if it has been measured. `remedy` is what to do if rows are
-    apart nevertheless.
+    apart nevertheless. `is_new` says whether the left picture is in no file: the pair was rectified or
+    swapped, or its file holds both views.
     """
 
     pair: StereoPair
@@ -59,6 +60,7 @@ class Prepared:
     notes: tuple[Note, ...] = ()
     alignment: Alignment | None = None
     remedy: Remedy = RECTIFY
+    is_new: bool = False
 
 
 @step("opening the pictures")
@@ -81,6 +83,7 @@ def prepare(pictures: Sequence[Path], request: Request) -> Prepared:
             pictures=tuple(pictures),
             notes=(*opened.notes, *ready.notes),
             remedy=_CALIBRATE_AGAIN,
+            is_new=_is_new(pictures, opened.pair, ready.pair),
         )
     camera, notes = _find_camera(opened.pair, opened.lens or Lens(), request)
     pair = replace(opened.pair, camera=camera)
@@ -95,7 +98,12 @@ def prepare(pictures: Sequence[Path], request: Request) -> Prepared:
         notes=(*opened.notes, *notes, *found.notes),
         alignment=found.alignment,
         remedy=RECTIFY if rectified is False else CALIBRATE,
+        is_new=_is_new(pictures, opened.pair, found.pair),
     )
+
+
+def _is_new(pictures: Sequence[Path], opened: StereoPair, ready: StereoPair) -> bool:
+    return len(pictures) == 1 or ready.left is not opened.left
 
 
 def _apply_calibration(pair: StereoPair, path: Path, rectified: bool) -> Rectified:
