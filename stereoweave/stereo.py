@@ -168,7 +168,8 @@ class Estimate:
         occluded: Mask, bool, of the pixels that only the left camera sees.
         pair: The aligned pair that the estimate belongs to, if `estimate` aligned it; None if the estimate
             belongs to the images as given.
-        notes: Notes on how `estimate` aligned the pair, or why it could not; `str` gives their text.
+        notes: Notes on how `estimate` aligned the pair, or why it could not, and on its other problems; `str`
+            gives their text.
     """
 
     disparity_px: Float[np.ndarray, "h w"]

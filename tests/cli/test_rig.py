@@ -97,7 +97,7 @@ def test_depth_and_view_rectify_a_pair_out_of_line_unless_told_otherwise(turned,
     assert main(["depth", LEFT, turned, "-o", str(tmp_path / "mended")]) == 0
     printed = capsys.readouterr().out
     assert "is rotated" not in printed
-    assert "keep the pictures as they are (--no-rectify)" in printed
+    assert "; the pictures can also be kept as they are (--no-rectify)" in printed
     assert main(["view", LEFT, turned, "--no-rectify", "-o", str(tmp_path / "view.png")]) == 0
     assert "is rotated 1.0 degrees" in capsys.readouterr().out
     assert main(["view", LEFT, turned, "-o", str(tmp_path / "view.png")]) == 0
