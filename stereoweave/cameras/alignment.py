@@ -103,7 +103,7 @@ class Alignment:
         return "negative_disparity" in self.defects and self.negative_percent >= _LEAST_NEGATIVE_PERCENT
 
     def lines(self) -> list[Note]:
-        """Return all findings as notes, with remedies for the defects."""
+        """Return all findings as notes, each once, with remedies for the defects."""
         if not self.is_known:
             return self.warnings()
         least_px, greatest_px = self.range_px
@@ -114,8 +114,9 @@ class Alignment:
             f"vertical error at {self.matches} matches: median {self.vertical_error_px:.2f} px, "
             f"95 % below {self.vertical_error_95_px:.2f} px",
             f"disparities: {least_px:.0f} to {greatest_px:.0f} px",
-            f"exposure: {exposure}",
         ]
+        if "exposure" not in self.defects:
+            found.append(f"exposure: {exposure}")
         defects = [self._note(defect) for defect in self.defects]
         sound = Note("no defects: the pair is rectified, and left and right are not swapped")
         return [*map(Note, found), *(defects or [sound])]
@@ -128,19 +129,19 @@ class Alignment:
         match defect:
             case "too_few_matches":
                 return Note(
-                    f"expected pictures with more texture, found {self.matches} matching points; the "
-                    "alignment of plain pictures cannot be checked"
+                    f"expected pictures with more texture, found {self._describe_matches()}; the alignment "
+                    "of plain pictures cannot be checked"
                 )
             case "unrelated":
                 return Note(
-                    f"expected two pictures of the same scene, found {self.matches} matching points; the "
+                    f"expected two pictures of the same scene, found {self._describe_matches()}; the "
                     "pictures show different scenes, or were taken from points too far apart",
                     Remedy("give the two pictures of one pair"),
                 )
             case "same_picture":
                 return Note(
-                    "left and right show the same view: all disparities are "
-                    f"{self.range_px[0]:.1f} to {self.range_px[1]:.1f} px, so no depth can be seen",
+                    f"left and right show the same view: all disparities are {self._describe_range()} px, "
+                    "so no depth can be seen",
                     Remedy("give two pictures from two positions"),
                 )
             case "swapped":
@@ -160,6 +161,17 @@ class Alignment:
                     f"disparities go down to {self.range_px[0]:.0f} px, as in 3-D films: matching supports "
                     "this, but metric depth requires doffs besides focal length and baseline"
                 )
+
+    def _describe_matches(self) -> str:
+        found = f"{self.matches} matching points"
+        if self.matches < _LEAST_MATCHES:
+            return f"{found} of the {_LEAST_MATCHES} that are needed"
+        return f"{found}, of which fewer than the {_LEAST_MATCHES} that are needed agree"
+
+    def _describe_range(self) -> str:
+        # Adding 0 turns -0.0 into 0.0.
+        least, greatest = (f"{round(px, 1) + 0.0:.1f}" for px in self.range_px)
+        return least if least == greatest else f"{least} to {greatest}"
 
     def _describe_rows(self, defect: Defect) -> str:
         match defect:
