@@ -17,7 +17,7 @@ import numpy as np
 
 from stereoweave import __version__
 from stereoweave.cameras.calibration_files import read_calibration_bytes
-from stereoweave.errors import NameOf, Note, Remedy, StereoweaveError, keyword
+from stereoweave.errors import NameOf, Note, StereoweaveError, keyword
 from stereoweave.io.colormap import colour_disparity, find_colour_range_px, grey_confidence
 from stereoweave.io.files import make_folder, make_parent_folder, reading
 from stereoweave.io.images import write_image
@@ -240,8 +240,8 @@ def _note_scaled(summary: Summary) -> Note:
     assert summary.disparity_scale_px is not None and summary.disparity_offset_px is not None
     formula = format_scale(summary.disparity_scale_px, summary.disparity_offset_px)
     return Note(
-        f"no disparity.png: expected disparities of 0 to 255.99 px, found {low_px:.2f} to {high_px:.2f} px",
-        Remedy(f"use disparity.pfm, or {SCALED}, in which px = {formula}"),
+        f"no disparity.png: expected disparities of 0 to 255.99 px, found {low_px:.2f} to {high_px:.2f} px; "
+        f"{SCALED} was written in its place, with px = {formula}"
     )
 
 

@@ -25,6 +25,7 @@ from stereoweave.outputs.run import Result
 from stereoweave.pictures.prepare import Request
 from stereoweave.stereo import Estimate, StereoCamera, StereoPair
 
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 TEXTURED = Path(__file__).resolve().parents[1] / "textured_pair"
 CALIBRATION = "cam0=[100 0 48; 0 100 32; 0 0 1]\ndoffs=0\nbaseline=80\nwidth=96\nheight=64\n"
 CAMERA = StereoCamera(focal_px=100.0, baseline_m=0.08, cx_px=48.0, cy_px=32.0)
@@ -89,7 +90,7 @@ def test_all_files_agree(folder):
 
 def test_the_left_picture_is_written_where_the_maps_fit_none_of_the_user_s(folder):
     for name in PICTURES:
-        write_image(name, read_image(TEXTURED / name))
+        write_image(name, read_image(EXAMPLES / name))
     make_depth(PICTURES, Path("sound"), PLAIN)
     assert "matched_left.png" not in names_in("sound")
     make_depth(PICTURES, Path("asked"), replace(PLAIN, files=("matched_left.png",)))
