@@ -114,6 +114,7 @@ def test_a_pair_with_different_exposures_is_advised_to_lock_them():
         rotation_degrees=0.0,
         scale=1.0,
         range_px=(5.0, 60.0),
+        negative_percent=0.0,
         exposure_ratio=2.0,
         defects=("exposure",),
     )

@@ -12,7 +12,7 @@ from stereoweave.stereo import StereoPair
 
 _SWAPPED = Note("left and right were swapped, and have been swapped back")
 _NO_BETTER = Note("the pair was not rectified, because its rows would not come closer")
-_KEEP = Remedy("keep the pictures as they are", ("no_rectify",))
+KEEP = Remedy("the pictures can also be kept as they are", ("no_rectify",))
 # The disparities of a pair out of line may have any sign. Left and right are swapped if the vote on the depth
 # order is below this.
 _SWAPPED_VOTE = -0.07
@@ -71,7 +71,7 @@ def align_rows(pair: StereoPair, *, parallel: bool = False) -> Aligned:
         return replace(as_it_is, notes=(note,))
     if not (rectified.alignment.vertical_error_95_px < before.vertical_error_95_px):
         return replace(as_it_is, notes=(_NO_BETTER,))
-    return replace(rectified, notes=tuple(replace(note, remedy=_KEEP) for note in rectified.notes))
+    return replace(rectified, notes=tuple(replace(note, remedy=KEEP) for note in rectified.notes))
 
 
 def _rectify(pair: StereoPair, *, parallel: bool) -> Aligned:

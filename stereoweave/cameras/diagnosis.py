@@ -11,6 +11,7 @@ from stereoweave.stereo import Estimate, StereoPair
 _CONFIDENT = 0.5
 # Sound pairs have at least 64 % confident pixels; noise and plain pictures have at most 12 %.
 _LEAST_CONFIDENT_PERCENT = 30.0
+GIVE_DOFFS = Remedy("give a calibration with doffs", ("calibration",))
 
 
 def find_problems(
@@ -19,7 +20,7 @@ def find_problems(
     alignment: Alignment | None = None,
     remedy: Remedy = RECTIFY,
 ) -> list[Note]:
-    """Return notes on a pair's problems; a sound pair has none.
+    """Return notes on the problems of a pair and its camera; a sound pair has none.
 
     The alignment is measured at feature matches (`stereoweave check` reports it in full). If there are too
     few matches, only the estimate's confidence decides, because a plain wall may be matched well.
@@ -31,6 +32,21 @@ def find_problems(
         remedy: What to do if rows are apart; another one than the default if rectification was tried.
     """
     alignment = alignment or check_pair(pair.left, pair.right)
+    return [*_find_defects(pair, estimate, alignment, remedy), *_check_camera(pair, alignment)]
+
+
+def _check_camera(pair: StereoPair, alignment: Alignment) -> list[Note]:
+    """Return a note if the camera puts much of the scene beyond infinity."""
+    if pair.camera is None or pair.camera.doffs_px or not alignment.needs_doffs:
+        return []
+    text = (
+        f"depths in metres are wrong: {alignment.negative_percent:.0f} % of the matches have negative "
+        "disparities, which doffs of 0 px put beyond infinity"
+    )
+    return [Note(text, GIVE_DOFFS)]
+
+
+def _find_defects(pair: StereoPair, estimate: Estimate, alignment: Alignment, remedy: Remedy) -> list[Note]:
     if alignment.is_known:
         warnings = alignment.warnings()
         if warnings:

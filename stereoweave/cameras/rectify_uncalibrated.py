@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 
 from stereoweave.cameras.camera_fit import CameraFit, Warps, fit_again, fit_cameras, make_parallel_cameras
 from stereoweave.cameras.feature_matches import Matches, find_matches
+from stereoweave.cameras.picture_warp import undistort
 from stereoweave.cameras.rectify import Rectified
 from stereoweave.cameras.row_field import RowField, fit_row_field
 from stereoweave.errors import Note, Remedy, StereoweaveError
@@ -271,9 +272,13 @@ def _describe(chosen: _Candidate, matches: Matches) -> Note:
     scaled_percent = 100 * (1 / chosen.cameras.scale - 1)
     changes = []
     if abs(scaled_percent) > _NOTABLE_SCALE_PERCENT:
-        changes.append(f"the right picture was scaled by {scaled_percent:+.1f} %")
+        way = "larger" if scaled_percent > 0 else "smaller"
+        changes.append(f"the right picture was made {abs(scaled_percent):.1f} % {way}")
     if abs(chosen.cameras.distortion) > _NOTABLE_DISTORTION:
-        changes.append("lens distortion was removed")
+        corner_px = np.zeros((1, 2))
+        moved_px = undistort(corner_px, chosen.cameras.distortion, chosen.cameras.size_px) - corner_px
+        by_px = float(np.hypot(*moved_px[0]))
+        changes.append(f"lens distortion was removed, which moved the corners by {by_px:.0f} px")
     if chosen.warps.right.field:
         turned = chosen.cameras.largest_degrees > 0
         changes.append("rows were bent" + (" where the rotation left them apart" if turned else ""))

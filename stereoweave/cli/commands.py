@@ -95,6 +95,8 @@ class Command(TyperCommand):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the command's arguments, and keep them as they were typed."""
+        if "" in args:
+            raise StereoweaveError("expected file names and values, found an empty one; is a variable unset?")
         ctx.meta[_WORDS] = shlex.join([*ctx.command_path.split(), *args])
         try:
             return super().parse_args(ctx, args)

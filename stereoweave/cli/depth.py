@@ -37,9 +37,9 @@ Write = Annotated[
     list[str] | None,
     typer.Option(
         metavar="NAME",
-        help="Additional file to write: disparity.npy, disparity.tiff or disparity_scaled.png; in metres, if "
-        "the camera is known, depth.pfm, depth.npy, depth.tiff, cloud.ply, cloud.glb, mesh.ply or mesh.glb; "
-        "or all. Repeatable.",
+        help="Additional file to write: disparity.npy, disparity.tiff, disparity_scaled.png or "
+        "matched_left.png; in metres, if the camera is known, depth.pfm, depth.npy, depth.tiff, cloud.ply, "
+        "cloud.glb, mesh.ply or mesh.glb; or all. Repeatable.",
     ),
 ]
 PicturesOrFolder = Annotated[
@@ -218,7 +218,7 @@ def _print_summary(summary: "Summary", notes: list[str], out: Path) -> None:
         ranges.append("depth infinite")
     elif summary.camera:
         ranges.append(f"depth {format_metres(summary.depth_p1_m)} to {format_metres(summary.depth_p99_m)}")
-    typer.echo(f"{', '.join(ranges)} (98 % of the pixels)")
+    typer.echo(f"{', '.join(ranges)} (the middle 98 % of the pixels)")
     for note in notes:
         typer.echo(note)
     typer.echo(f"files: {', '.join(_list_files(out))}")

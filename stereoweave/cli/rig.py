@@ -4,7 +4,7 @@ import json
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -12,7 +12,7 @@ import typer
 
 from stereoweave.cli.commands import running_options, shows_steps
 from stereoweave.cli.options import AsJson, Calib, Format, Pictures, make_parent_folder
-from stereoweave.errors import StereoweaveError
+from stereoweave.errors import Note, StereoweaveError
 from stereoweave.system.steps import step
 
 
@@ -29,7 +29,8 @@ def check(pictures: Pictures, format: Format = None, as_json: AsJson = False) ->
     opened = open_pictures(pictures, format)
     with step("checking the pair"):
         found = check_pair(opened.pair.left, opened.pair.right)
-    notes = [note.format(_name_remedy) for note in (*opened.notes, *found.lines())]
+    lines = _advise_once(found.lines())
+    notes = [note.format(running_options()) for note in (*opened.notes, *lines)]
     if as_json:
         facts = {name: _replace_nan(value) for name, value in asdict(found).items()}
         typer.echo(json.dumps(facts | {"notes": notes}, indent=2, allow_nan=False))
@@ -39,9 +40,15 @@ def check(pictures: Pictures, format: Format = None, as_json: AsJson = False) ->
         raise typer.Exit(1)
 
 
-def _name_remedy(setting: str) -> str | None:
-    """Return the option of `check` for a setting; for rectification, the command that rectifies."""
-    return "stereoweave rectify" if setting == "rectify" else running_options()(setting)
+def _advise_once(notes: Sequence[Note]) -> list[Note]:
+    """Replace the advice of each note to rectify the pair by one line about the commands that do it."""
+    from stereoweave.cameras.alignment import RECTIFY
+
+    lines = [replace(note, remedy=None) if note.remedy == RECTIFY else note for note in notes]
+    if lines != list(notes):
+        text = "depth and view rectify such a pair by themselves; stereoweave rectify writes its pictures"
+        lines.append(Note(text))
+    return lines
 
 
 def _replace_nan(value: object) -> object:
@@ -55,8 +62,14 @@ def _replace_nan(value: object) -> object:
 def rectify(
     pictures: Pictures,
     out: Annotated[
-        Path, typer.Option("--out", "-o", help="Folder to write left.png, right.png and calib.yml to.")
-    ],
+        Path | None,
+        typer.Option(
+            "--out",
+            "-o",
+            help="Folder to write left.png, right.png and calib.yml to (default: in the current folder, "
+            "named after the left picture, such as left_rectified).",
+        ),
+    ] = None,
     format: Format = None,
     calib: Calib = None,
 ) -> None:
@@ -73,6 +86,7 @@ def rectify(
     from stereoweave.io.output_lock import lock_output
     from stereoweave.pictures.prepare import Request, prepare
 
+    out = out or Path(f"{pictures[0].stem}_rectified")
     _check_output(pictures, calib, out)
     make_parent_folder(out / "left.png", out / "right.png", out / "calib.yml")
     prepared = prepare(pictures, Request(format=format, calibration=calib, rectify=True))

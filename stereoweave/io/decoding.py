@@ -20,7 +20,7 @@ from PIL import Image, UnidentifiedImageError, features
 from stereoweave.errors import FormatError, Remedy, reason
 from stereoweave.io import exif, heif
 from stereoweave.io.colour_profiles import make_profile
-from stereoweave.io.similar_names import describe_missing
+from stereoweave.io.similar_names import as_typed, describe_missing
 from stereoweave.stereo import LONGEST_SIDE_PX
 
 # 50 megapixels per view are supported; cameras of that class have up to 64. The limit is checked against the
@@ -129,7 +129,7 @@ def check_regular(path: Path, expected: str) -> None:
     try:
         mode = path.stat().st_mode
     except FileNotFoundError as error:
-        raise FormatError(f"{path}: expected {expected}, found {describe_missing(path)}") from error
+        raise FormatError(f"{as_typed(path)}: expected {expected}, found {describe_missing(path)}") from error
     except (OSError, ValueError) as error:  # ValueError: a name with a zero byte
         raise FormatError(f"{path}: expected {expected}, found {reason(error)}") from error
     if not stat.S_ISREG(mode):

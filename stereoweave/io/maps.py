@@ -20,7 +20,7 @@ from stereoweave.io.images import checking_format_size, save_picture
 _PFM_HEADER = re.compile(rb"Pf\s+(\d{1,9})\s+(\d{1,9})\s+(\S{1,99})\s")
 _LONGEST_PFM_HEADER = 256
 # Disparity in px = 16-bit value * scale + offset; without these text chunks, value / 256.
-_SCALE, _OFFSET = "disparity_scale_px", "disparity_offset_px"
+_SCALE, _OFFSET, _UNKNOWN = "disparity_scale_px", "disparity_offset_px", "disparity_unknown_value"
 _STEP_PX = 1 / 256
 _MOST_STEPS = 65535
 
@@ -176,13 +176,15 @@ def write_scaled_disparity_png(path: str | Path, disparity_px: Float[np.ndarray,
     """Write disparities of any range as a 16-bit PNG; NaN and infinity become 0 (unknown).
 
     The disparity of a value is value * scale + offset. The text chunks disparity_scale_px and
-    disparity_offset_px contain both (`find_scale`; 1/256 and 0 if KITTI's format can hold the range).
+    disparity_offset_px contain both (`find_scale`; 1/256 and 0 if KITTI's format can hold the range);
+    disparity_unknown_value is 0.
     """
     known = np.isfinite(disparity_px)
     scale_px, offset_px = find_scale(*_find_range_px(disparity_px)) or (_STEP_PX, 0.0)
     steps = np.rint((np.where(known, disparity_px, 0).astype(np.float64) - offset_px) / scale_px)
     steps = np.where(known, np.clip(steps, 1, _MOST_STEPS), 0).astype(np.uint16)
-    save_picture(path, steps, "PNG", texts={_SCALE: repr(scale_px), _OFFSET: repr(offset_px)})
+    texts = {_SCALE: repr(scale_px), _OFFSET: repr(offset_px), _UNKNOWN: "0"}
+    save_picture(path, steps, "PNG", texts=texts)
 
 
 def _find_range_px(disparity_px: Float[np.ndarray, "h w"]) -> tuple[float, float]:

@@ -8,6 +8,11 @@ from pathlib import Path
 _MOST_FILES = 10_000
 
 
+def as_typed(path: Path) -> str:
+    """Return a path as the user typed it: an address has two slashes, of which a path keeps one."""
+    return re.sub(r"^(https?):/+", r"\1://", str(path))
+
+
 def describe_missing(path: Path) -> str:
     """Return what was found in place of a missing file, with the file that was probably meant, if any."""
     if re.match(r"https?:/", str(path)):

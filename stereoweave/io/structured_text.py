@@ -109,7 +109,7 @@ def _parse_yaml(text: str) -> Any:
         return yaml.load(re.sub(r"\A\s*%YAML.*", "", text), _Loader)
     except yaml.MarkedYAMLError as error:
         where = f" in line {error.problem_mark.line + 1}" if error.problem_mark else ""
-        raise ValueError(f"{error.problem}{where}") from error
+        raise ValueError(f"it is not valid YAML{where}") from error
     except yaml.YAMLError as error:
         raise ValueError(str(error)) from error
 

@@ -295,7 +295,7 @@ def _list_numbers(summary: Summary) -> list[tuple[str, str]]:
         ("Model", summary.model),
         ("Time", _format_time(summary)),
         (
-            "Disparity (98 % of the pixels)",
+            "Disparity (the middle 98 % of the pixels)",
             f"{summary.disparity_p1_px:.1f} to {summary.disparity_p99_px:.1f} px",
         ),
         ("Median disparity", f"{summary.disparity_median_px:.1f} px"),
@@ -306,7 +306,7 @@ def _list_numbers(summary: Summary) -> list[tuple[str, str]]:
     if summary.camera:
         rows += [
             (
-                "Depth (98 % of the pixels)",
+                "Depth (the middle 98 % of the pixels)",
                 f"{format_metres(summary.depth_p1_m)} to {format_metres(summary.depth_p99_m)}",
             ),
             ("Median depth", format_metres(summary.depth_median_m)),

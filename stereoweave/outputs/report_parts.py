@@ -32,6 +32,7 @@ CONTENTS = {
     "preview.png": "disparity in colour, full size",
     "confidence.png": "confidence, black is 0, white is 1",
     "occluded.png": "white where only the left camera sees",
+    "matched_left.png": "the left picture to which the maps belong",
     "cloud.ply": "point cloud in metres, for CloudCompare or MeshLab",
     "cloud.glb": "point cloud in metres, for Blender",
     "mesh.ply": "mesh in metres, for MeshLab",

@@ -17,7 +17,7 @@ import numpy as np
 
 from stereoweave import __version__
 from stereoweave.cameras.calibration_files import read_calibration_bytes
-from stereoweave.errors import NameOf, Note, Remedy, StereoweaveError, keyword
+from stereoweave.errors import NameOf, Note, StereoweaveError, keyword
 from stereoweave.io.colormap import colour_disparity, find_colour_range_px, grey_confidence
 from stereoweave.io.files import make_folder, make_parent_folder, reading
 from stereoweave.io.images import write_image
@@ -45,9 +45,8 @@ from stereoweave.outputs.point_cloud import (
 from stereoweave.outputs.report import Context, Summary, write_report
 from stereoweave.outputs.report_parts import CONTENTS
 from stereoweave.outputs.run import Result, run
-from stereoweave.pictures.prepare import Request, prepare
+from stereoweave.pictures.prepare import Prepared, Request, prepare
 from stereoweave.rendering.rehearsals import rehearse_drawing, rehearse_filling
-from stereoweave.stereo import StereoPair
 from stereoweave.system.compiling_ahead import compile_ahead
 from stereoweave.system.steps import step
 
@@ -84,6 +83,7 @@ FILES: dict[str, Callable[[Path, Result], None]] = {
     "preview.png": _write_preview,
     "confidence.png": lambda path, result: write_image(path, grey_confidence(result.estimate.confidence)),
     "occluded.png": lambda path, result: write_image(path, np.uint8(255) * result.estimate.occluded),
+    "matched_left.png": lambda path, result: write_image(path, result.pair.left),
     "cloud.ply": lambda path, result: write_ply(path, result.point_cloud),
     "cloud.glb": lambda path, result: write_glb(path, result.point_cloud),
     "mesh.ply": lambda path, result: write_ply(path, result.mesh),
@@ -94,6 +94,8 @@ ALWAYS = ("disparity.pfm", "disparity.png", "preview.png", "confidence.png", "oc
 ALL = "all"
 REPORT = "report.html"
 SCALED = "disparity_scaled.png"
+# It is not called left.png, because the user's own pictures often are, and may lie in the same folder.
+LEFT = "matched_left.png"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +107,7 @@ class DepthJob:
         backend: The matcher and the hardware that runs it.
         options: Matching settings.
         files: Output files besides `always`: names in FILES, or "all". depth.png is added if the camera is
-            known.
+            known, and matched_left.png if the maps fit no picture of the user's.
         always: Output files written for every pair.
         name_of: The front end's names for settings, for the notes and errors that a batch records.
         command: The command as typed, for the reports.
@@ -131,7 +133,7 @@ def make_depth(pictures: Sequence[Path], out: Path, job: DepthJob) -> tuple[Summ
     """Write all the results for a pair to `out` atomically. Returns the summary and user-facing notes."""
     matcher = job.backend.matcher()
     prepared = prepare(pictures, job.request)
-    files, left_out = _choose_files(job, prepared.pair)
+    files, left_out = _choose_files(job, prepared)
     if REPORT in files:
         compile_ahead(rehearse_drawing, rehearse_filling)
     with _write_together(out) as folder:
@@ -169,13 +171,15 @@ def needs_camera(file: str) -> bool:
     return file.startswith(("depth.", "cloud.", "mesh."))
 
 
-def _choose_files(job: DepthJob, pair: StereoPair) -> tuple[list[str], list[Note]]:
+def _choose_files(job: DepthJob, prepared: Prepared) -> tuple[list[str], list[Note]]:
     """Return a pair's output files, and notes on the files that are left out.
 
     Raises:
         StereoweaveError: A file needs a camera but the pair has none, or trimesh is missing.
     """
-    wanted, notes = {*job.always, *job.files}, list[Note]()
+    pair, wanted, notes = prepared.pair, {*job.always, *job.files}, list[Note]()
+    if prepared.is_new:
+        wanted.add(LEFT)
     if pair.camera:
         wanted.add("depth.png")
     if ALL in wanted:
@@ -236,8 +240,8 @@ def _note_scaled(summary: Summary) -> Note:
     assert summary.disparity_scale_px is not None and summary.disparity_offset_px is not None
     formula = format_scale(summary.disparity_scale_px, summary.disparity_offset_px)
     return Note(
-        f"no disparity.png: expected disparities of 0 to 255.99 px, found {low_px:.2f} to {high_px:.2f} px",
-        Remedy(f"use disparity.pfm, or {SCALED}, in which px = {formula}"),
+        f"no disparity.png: expected disparities of 0 to 255.99 px, found {low_px:.2f} to {high_px:.2f} px; "
+        f"{SCALED} was written in its place, with px = {formula}"
     )
 
 

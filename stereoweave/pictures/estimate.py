@@ -6,7 +6,8 @@ from typing import Literal
 
 from stereoweave.arguments import describe
 from stereoweave.cameras import auto_align
-from stereoweave.errors import Remedy, StereoweaveError
+from stereoweave.cameras.diagnosis import find_problems
+from stereoweave.errors import Note, Remedy, StereoweaveError
 from stereoweave.io.arrays import ImageLike, as_rgb
 from stereoweave.matching.backend import Backend
 from stereoweave.matching.estimate import match
@@ -14,6 +15,8 @@ from stereoweave.matching.options import MatchOptions
 from stereoweave.matching.providers import CPU
 from stereoweave.pictures.prepare import Prepared, Request, prepare
 from stereoweave.stereo import Estimate, StereoPair
+
+_RECTIFY_FIRST = Remedy("give pictures that are rectified by a calibration")
 
 
 def estimate(  # noqa: PLR0913 - all but the images are keyword-only and optional
@@ -45,7 +48,8 @@ def estimate(  # noqa: PLR0913 - all but the images are keyword-only and optiona
         range_px: See `MatchOptions`.
         align: "auto" for pictures of unknown cameras: if the rows are apart or the sides are swapped, the
             pair is aligned first (`auto_align.align`). The estimate then belongs to the aligned pair, which
-            it holds as `pair`, with `notes` on what was changed. Default: the images must be rectified.
+            it holds as `pair`, with `notes` on what was changed and on problems that remain, such as two
+            pictures of different scenes. Default: the images must be rectified, and are not checked.
 
     Raises:
         ValueError: MatcherError for an unknown model or an unavailable provider, ProviderError for a provider
@@ -66,7 +70,11 @@ def estimate(  # noqa: PLR0913 - all but the images are keyword-only and optiona
         return match(matcher, given, options)
     aligned = auto_align.align(given)
     found = match(matcher, aligned.pair, options)
-    return replace(found, pair=None if aligned.pair is given else aligned.pair, notes=aligned.notes)
+    notes = (
+        *map(_fit_to_python, aligned.notes),
+        *find_problems(aligned.pair, found, aligned.alignment, _RECTIFY_FIRST),
+    )
+    return replace(found, pair=None if aligned.pair is given else aligned.pair, notes=notes)
 
 
 def _open_both(file: ImageLike, *, aligned: bool) -> Prepared:
@@ -78,3 +86,8 @@ def _open_both(file: ImageLike, *, aligned: bool) -> Prepared:
             remedy=Remedy("give it, or the path of one file with both views"),
         )
     return prepare([Path(file)], Request(rectify=None if aligned else False))
+
+
+def _fit_to_python(note: Note) -> Note:
+    """Return the note without a remedy that undoes the alignment, which the caller has asked for."""
+    return replace(note, remedy=None) if note.remedy == auto_align.KEEP else note

@@ -4,9 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from stereoweave.cameras.alignment import RECTIFY, Alignment
+from stereoweave.cameras.alignment import RECTIFY, Alignment, check_pair
 from stereoweave.cameras.auto_align import align
 from stereoweave.cameras.calibration_files import read_rig
+from stereoweave.cameras.diagnosis import GIVE_DOFFS
 from stereoweave.cameras.rectify import Rectified, rectify
 from stereoweave.cameras.rig import pair_size_px
 from stereoweave.errors import Note, Remedy, StereoweaveError
@@ -51,7 +52,8 @@ class Prepared:
     """A pair ready for matching, its picture files, and notes on what was detected or changed.
 
     `alignment` is the alignment of the pair, if it has been measured. `remedy` is what to do if rows are
-    apart nevertheless.
+    apart nevertheless. `is_new` says whether the left picture is in no file: the pair was rectified or
+    swapped, or its file holds both views.
     """
 
     pair: StereoPair
@@ -59,6 +61,7 @@ class Prepared:
     notes: tuple[Note, ...] = ()
     alignment: Alignment | None = None
     remedy: Remedy = RECTIFY
+    is_new: bool = False
 
 
 @step("opening the pictures")
@@ -66,8 +69,9 @@ def prepare(pictures: Sequence[Path], request: Request) -> Prepared:
     """Open a pair from two pictures (left first) or one picture with both views; rectify it if needed.
 
     The camera comes from the calibration, from the request, or from the pictures' metadata. The pair has no
-    camera if the focal length or the baseline is unknown, or if the cameras are not known to be parallel and
-    rectification from feature matches did not find them so.
+    camera if the focal length or the baseline is unknown, if the cameras are not known to be parallel and
+    rectification from feature matches did not find them so, or if the camera is from metadata without doffs
+    and many disparities are negative.
 
     Raises:
         StereoweaveError: See `open_pictures`, `read_rig`, `rectify` and `rectify_by_features`; or the request
@@ -81,20 +85,28 @@ def prepare(pictures: Sequence[Path], request: Request) -> Prepared:
             pictures=tuple(pictures),
             notes=(*opened.notes, *ready.notes),
             remedy=_CALIBRATE_AGAIN,
+            is_new=_is_new(pictures, opened.pair, ready.pair),
         )
     lens = opened.lens or Lens()
     camera, notes = _find_camera(opened.pair, lens, request)
     pair = replace(opened.pair, camera=camera)
     in_metres = request.focal_px is not None or request.baseline_m is not None
-    rectify = False if in_metres and request.rectify is None else request.rectify
-    found = _align(pair, rectify, parallel=lens.parallel)
+    rectified = False if in_metres and request.rectify is None else request.rectify
+    found = _align(pair, rectified, parallel=lens.parallel)
+    if not in_metres:
+        found = _drop_camera_without_doffs(found)
     return Prepared(
         pair=found.pair,
         pictures=tuple(pictures),
         notes=(*opened.notes, *notes, *found.notes),
         alignment=found.alignment,
-        remedy=CALIBRATE if found.alignment else RECTIFY,
+        remedy=RECTIFY if rectified is False else CALIBRATE,
+        is_new=_is_new(pictures, opened.pair, found.pair),
     )
+
+
+def _is_new(pictures: Sequence[Path], opened: StereoPair, ready: StereoPair) -> bool:
+    return len(pictures) == 1 or ready.left is not opened.left
 
 
 def _apply_calibration(pair: StereoPair, path: Path, rectified: bool) -> Rectified:
@@ -160,3 +172,22 @@ def _align(pair: StereoPair, rectified: bool | None, *, parallel: bool) -> _Read
         CALIBRATE,
     )
     return replace(ready, notes=(*ready.notes, lost))
+
+
+def _drop_camera_without_doffs(ready: _Ready) -> _Ready:
+    """Drop a camera whose doffs are unknown if many disparities are negative: its depths would be wrong."""
+    pair = ready.pair
+    if pair.camera is None:
+        return ready
+    alignment = ready.alignment or check_pair(pair.left, pair.right)
+    if not alignment.needs_doffs:
+        return replace(ready, alignment=alignment)
+    text = (
+        f"no depth in metres: {alignment.negative_percent:.0f} % of the matches have negative disparities, "
+        "as from converged cameras, whose doffs are not in EXIF"
+    )
+    return _Ready(
+        pair=replace(pair, camera=None),
+        notes=(*ready.notes, Note(text, GIVE_DOFFS)),
+        alignment=alignment,
+    )

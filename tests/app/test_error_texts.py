@@ -168,4 +168,6 @@ def test_a_note_names_settings_by_their_label(say, text):
 def test_an_aligned_pair_is_told_so_with_the_label_that_keeps_it(say):
     (line,) = [line for line in say({"left": "upper.png", "right": "lower.png"}, {}) if "rectified" in line]
     assert line.startswith("rectified: rows are off by ")
-    assert line.endswith("(2.00 px before); keep the pictures as they are (untick “Align the pictures”)")
+    assert line.endswith(
+        "(2.00 px before); the pictures can also be kept as they are (untick “Align the pictures”)"
+    )

@@ -112,10 +112,13 @@ def test_pictures_of_two_scenes_and_plain_ones_are_told_apart(pairs):
     assert unrelated.lines() == unrelated.warnings()
     assert str(unrelated.lines()[0]).startswith("expected two pictures of the same scene, found ")
     assert str(unrelated.lines()[0]).endswith("; give the two pictures of one pair")
+    assert "20 that are needed" in str(unrelated.lines()[0])
     plain = np.full((100, 200, 3), 90, np.uint8)
     found = check_pair(plain, plain)
     assert found.defects == ("too_few_matches",)
-    assert str(found.lines()[0]).startswith("expected pictures with more texture, found 0 matching points")
+    assert str(found.lines()[0]).startswith(
+        "expected pictures with more texture, found 0 matching points of the 20"
+    )
     assert not (found.is_known or found.is_rectified)
 
 
@@ -127,6 +130,7 @@ def test_one_picture_given_twice_is_named(pairs):
         assert found.defects == ("same_picture",)
         assert str(found.warnings()[0]).startswith("left and right show the same view: ")
         assert str(found.warnings()[0]).endswith("; give two pictures from two positions")
+    assert "all disparities are 0.0 px, so" in str(check_pair(left, left).warnings()[0])
 
 
 def test_each_defect_has_a_note(pairs):

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ from stereoweave.errors import Remedy
 from stereoweave.io.images import read_image, read_pair
 from stereoweave.learn.data.collage import paint_collage
 from stereoweave.matching.matcher import Matcher
-from stereoweave.stereo import Estimate, StereoPair
+from stereoweave.stereo import Estimate, StereoCamera, StereoPair
 
 TEXTURED = Path(__file__).resolve().parents[1] / "textured_pair"
 
@@ -69,6 +70,19 @@ def test_negative_disparities_by_themselves_are_no_reason_for_a_line(example):
     left, right = (np.ascontiguousarray(x) for x in (example.left[:, 20:], example.right[:, :-20]))
     converged = StereoPair(left=left, right=right)
     assert find_problems(converged, estimate_of(converged, 0.9)) == []
+
+
+def test_a_camera_that_puts_many_points_beyond_infinity_gets_a_line(example):
+    camera = StereoCamera(focal_px=600.0, baseline_m=0.1, cx_px=310.0, cy_px=240.0)
+    left, right = (np.ascontiguousarray(x) for x in (example.left[:, 30:], example.right[:, :-30]))
+    converged = StereoPair(left=left, right=right, camera=camera)
+    (line,) = find_problems(converged, estimate_of(converged, 0.9))
+    assert str(line).startswith("depths in metres are wrong: ")
+    assert str(line).endswith("put beyond infinity; give a calibration with doffs (calibration)")
+    complete = replace(converged, camera=replace(camera, doffs_px=30.0))
+    assert find_problems(complete, estimate_of(complete, 0.9)) == []
+    parallel = replace(example, camera=camera)
+    assert find_problems(parallel, estimate_of(parallel, 0.9)) == []
 
 
 def test_low_confidence_nearly_everywhere_is_reported():

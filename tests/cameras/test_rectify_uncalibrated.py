@@ -1,3 +1,4 @@
+import re
 from pathlib import Path
 
 import cv2
@@ -5,6 +6,7 @@ import numpy as np
 import pytest
 
 from stereoweave.cameras.alignment import check_pair
+from stereoweave.cameras.picture_warp import PictureWarp
 from stereoweave.cameras.rectify_uncalibrated import rectify_by_features
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.images import read_pair
@@ -80,6 +82,24 @@ def test_pixels_outside_the_source_are_masked_and_repeat_the_border(mended):
     assert 0.8 < seen.mean() < 1
     # A black border would be darker than everything in the picture.
     assert mended.pair.right[~seen].mean() > mended.pair.right[seen].mean() / 2
+
+
+@pytest.mark.parametrize(("zoom", "text"), [(1.03, "made 2.9 % smaller"), (0.97, "made 3.1 % larger")])
+def test_the_note_says_how_the_size_was_changed(example, zoom, text):
+    size = example.left.shape[1::-1]
+    zoomed = cv2.getRotationMatrix2D((size[0] / 2, size[1] / 2), 0, zoom)
+    right = cv2.warpAffine(example.right, zoomed, size, borderMode=cv2.BORDER_REPLICATE)
+    (note,) = rectify_by_features(StereoPair(left=example.left, right=right)).notes
+    assert f"the right picture was {text}" in note.text
+
+
+def test_the_note_says_how_far_the_corners_moved_as_distortion_was_removed(example):
+    warp = PictureWarp(homography=np.eye(3), distortion=0.15, size_px=example.left.shape[1::-1])
+    left, right = (warp.apply(image, None)[0] for image in (example.left, example.right))
+    (note,) = rectify_by_features(StereoPair(left=left, right=right)).notes
+    # A distortion of -0.15 moves the corners, 400 px from the centre, by about 0.15 / 0.85 * 400 = 71 px.
+    (by_px,) = re.findall("distortion was removed, which moved the corners by ([0-9]+) px", note.text)
+    assert 50 < int(by_px) < 100
 
 
 def test_a_sound_pair_stays_nearly_what_it_is(example):

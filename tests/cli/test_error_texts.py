@@ -57,7 +57,7 @@ ERRORS = {
     "depth lef.png right.png": f"lef.png: expected {PICTURE}, found no such file; did you mean left.png?",
     "depth left.png Right.png": f"Right.png: expected {PICTURE}, found no such file; did you mean right.png?",
     "depth *.jpg": f"*.jpg: expected {PICTURE}, found no file that matches",
-    "depth http://a.org/left.png right.png": f"http:/a.org/left.png: expected {PICTURE}, found an address; "
+    "depth http://a.org/left.png right.png": f"http://a.org/left.png: expected {PICTURE}, found an address; "
     "download the file first, because nothing is fetched",
     "depth left.png notes.txt": f"notes.txt: expected {PICTURE}, found another type of file; save it as PNG "
     "or JPEG",
@@ -111,8 +111,8 @@ ERRORS = {
     "bench collages -o set --pairs 2 --size 64x16": "--size: expected at least 32x32 pixels, found 64x16",
 }
 NOTES = {
-    "check upper.png lower.png": "the right picture is 2.0 px lower than the left one; rectify the pair "
-    "(stereoweave rectify)",
+    "check upper.png lower.png": "depth and view rectify such a pair by themselves; stereoweave rectify "
+    "writes its pictures",
     "check both.png": "side_by_side, detected from name and content; override it if it is wrong (--format)",
     "check right.png left.png": "left and right are swapped; give them the other way round",
     "depth inwards_left.png inwards_right.png --focal-px 640 --baseline-m 0.1 --rectify --model small "

@@ -170,3 +170,10 @@ def test_an_address_that_no_computer_has_is_not_mended_by_another_port(capfd):
     assert capfd.readouterr().err.startswith(
         "stereoweave: --host nowhere.invalid: expected an address of this computer, found another one; "
     )
+
+
+@pytest.mark.parametrize("words", [["depth", "", ""], ["view", "left.png", ""], ["check", ""]])
+def test_an_empty_word_is_an_error(words, capsys):
+    assert main(words) == 2
+    expected = "expected file names and values, found an empty one; is a variable unset?"
+    assert capsys.readouterr().err == f"stereoweave: {expected}\n"

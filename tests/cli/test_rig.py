@@ -45,6 +45,25 @@ def test_the_check_gives_its_numbers_as_json(turned, capsys):
     assert abs(found["rotation_degrees"]) == pytest.approx(1, abs=0.1)
 
 
+def test_the_check_says_once_what_rectifies_a_pair(turned, tmp_path, capsys):
+    picture = read_image(turned)
+    write_image(tmp_path / "lower.png", np.roll(picture, 5, axis=0))
+    assert main(["check", LEFT, str(tmp_path / "lower.png")]) == 1
+    *lines, last = capsys.readouterr().out.splitlines()
+    assert sum("right picture is" in line for line in lines) == 2
+    assert "rectif" not in " ".join(lines)
+    assert last == (
+        "depth and view rectify such a pair by themselves; stereoweave rectify writes its pictures"
+    )
+
+
+def test_the_check_names_a_difference_in_exposure_once(tmp_path, capsys):
+    write_image(tmp_path / "dark.png", (read_image(RIGHT) * 0.6).astype(np.uint8))
+    assert main(["check", LEFT, str(tmp_path / "dark.png")]) == 1
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if "exposure of" in line)
+    assert line.startswith("the left picture has 3.1 times the exposure of the other")
+
+
 def test_unknown_values_of_a_plain_pair_are_null_in_json(tmp_path, capsys):
     write_image(tmp_path / "plain.png", np.full((64, 96, 3), 90, np.uint8))
     assert main(["check", str(tmp_path / "plain.png"), str(tmp_path / "plain.png"), "--json"]) == 1
@@ -59,6 +78,12 @@ def test_a_pair_rectified_by_its_features_passes_the_check(turned, tmp_path, cap
     pair = read_pair(tmp_path / "out" / "left.png", tmp_path / "out" / "right.png")
     assert check_pair(pair.left, pair.right).defects == ()
     assert "rectified: rows are off by" in capsys.readouterr().out
+
+
+def test_rectified_pictures_are_named_after_the_left_one_by_default(turned, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["rectify", LEFT, turned]) == 0
+    assert sorted(path.name for path in Path("left_rectified").iterdir()) == ["left.png", "right.png"]
 
 
 def test_the_new_calibration_fits_the_new_pictures(tmp_path):
@@ -97,7 +122,7 @@ def test_depth_and_view_rectify_a_pair_out_of_line_unless_told_otherwise(turned,
     assert main(["depth", LEFT, turned, "-o", str(tmp_path / "mended")]) == 0
     printed = capsys.readouterr().out
     assert "is rotated" not in printed
-    assert "keep the pictures as they are (--no-rectify)" in printed
+    assert "; the pictures can also be kept as they are (--no-rectify)" in printed
     assert main(["view", LEFT, turned, "--no-rectify", "-o", str(tmp_path / "view.png")]) == 0
     assert "is rotated 1.0 degrees" in capsys.readouterr().out
     assert main(["view", LEFT, turned, "-o", str(tmp_path / "view.png")]) == 0

@@ -318,7 +318,7 @@ def test_the_words_after_depth_are_the_range_of_most_pixels_in_pixels_and_metres
     assert run("depth left.png right.png --raw --model eight.onnx --calib calib.txt -o out") == 0
     printed = capfd.readouterr().out.splitlines()
     # 100 px * 0.08 m / 8 px = 1 m
-    assert "disparity 8.0 to 8.0 px, depth 1.00 m to 1.00 m (98 % of the pixels)" in printed
+    assert "disparity 8.0 to 8.0 px, depth 1.00 m to 1.00 m (the middle 98 % of the pixels)" in printed
     files = "disparity.pfm, disparity.png, depth.png, preview.png, confidence.png, occluded.png, report.html"
     assert printed[-2:] == [f"files: {files}", "report: out/report.html"]
 
@@ -364,7 +364,7 @@ def test_a_disparity_that_a_png_cannot_hold_gets_a_note_instead_of_a_png(picture
     printed, _ = capfd.readouterr()
     text = "no disparity.png: expected disparities of 0 to 255.99 px"
     (note,) = [line for line in printed.splitlines() if text in line]
-    assert " px; use disparity.pfm, or disparity_scaled.png, in which px = value / 256 " in note
+    assert " px; disparity_scaled.png was written in its place, with px = value / 256 " in note
     assert not Path("out/disparity.png").exists()
     # The photographs do not show this disparity, so refinement moves it by at most 1 px.
     np.testing.assert_allclose(read_pfm("out/disparity.pfm"), disparity_px, atol=1.001)

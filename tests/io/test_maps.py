@@ -115,7 +115,11 @@ def test_a_scaled_png_holds_negative_and_large_disparities_with_scale_and_offset
     maps.write_scaled_disparity_png(path, np.array([[-3.5, 0.0, 600.0, np.nan]]))
     # From an offset of -5 to 600 are 605 px; 65,535 steps of 1/128 px are 512 px, too few, of 1/64 px enough.
     with Image.open(path) as picture:
-        assert picture.text == {"disparity_scale_px": "0.015625", "disparity_offset_px": "-5.0"}
+        assert picture.text == {
+            "disparity_scale_px": "0.015625",
+            "disparity_offset_px": "-5.0",
+            "disparity_unknown_value": "0",
+        }
     np.testing.assert_array_equal(stored(path), [[1.5 * 64, 5 * 64, 605 * 64, 0]])
     assert maps.format_scale(0.015625, -5.0) == "value / 64 - 5"
     assert maps.format_scale(0.25, 7.0) == "value / 4 + 7"

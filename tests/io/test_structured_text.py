@@ -152,6 +152,11 @@ def test_text_without_named_entries_is_refused(text):
         parse_entries(text)
 
 
+def test_text_of_another_kind_is_named_by_its_line():
+    with pytest.raises(ValueError, match="^it is not valid YAML in line 2$"):
+        parse_entries("a: 1\nb: c: d\n")
+
+
 def test_values_are_strings_with_any_tag_or_form():
     text = "a: 1\nb: 2001-01-01\nc: !!int 2\nd: '~'\ne: !!python/name:os.system\nf: yes\n<<: {g: 1:59}\n"
     assert parse_entries(text) == {

@@ -25,6 +25,7 @@ from stereoweave.outputs.run import Result
 from stereoweave.pictures.prepare import Request
 from stereoweave.stereo import Estimate, StereoCamera, StereoPair
 
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 TEXTURED = Path(__file__).resolve().parents[1] / "textured_pair"
 CALIBRATION = "cam0=[100 0 48; 0 100 32; 0 0 1]\ndoffs=0\nbaseline=80\nwidth=96\nheight=64\n"
 CAMERA = StereoCamera(focal_px=100.0, baseline_m=0.08, cx_px=48.0, cy_px=32.0)
@@ -87,6 +88,38 @@ def test_all_files_agree(folder):
     np.testing.assert_array_equal(glb_mesh.faces, mesh.faces)
 
 
+def test_the_left_picture_is_written_where_the_maps_fit_none_of_the_user_s(folder):
+    for name in PICTURES:
+        write_image(name, read_image(EXAMPLES / name))
+    make_depth(PICTURES, Path("sound"), PLAIN)
+    assert "matched_left.png" not in names_in("sound")
+    make_depth(PICTURES, Path("asked"), replace(PLAIN, files=("matched_left.png",)))
+    np.testing.assert_array_equal(read_image("asked/matched_left.png"), read_image("left.png"))
+    _, notes = make_depth(PICTURES[::-1], Path("swapped"), PLAIN)
+    assert any("swapped back" in str(note) for note in notes)
+    np.testing.assert_array_equal(read_image("swapped/matched_left.png"), read_image("left.png"))
+    assert "the left picture to which the maps belong" in Path("swapped/report.html").read_text()
+
+
+def test_the_left_half_of_a_file_with_both_views_is_written(folder):
+    left, right = (read_image(TEXTURED / name) for name in ("left.png", "right.png"))
+    write_image("both.png", np.hstack([left, right]))
+    job = replace(PLAIN, request=Request(format="side_by_side"))
+    make_depth([Path("both.png")], Path("out"), job)
+    np.testing.assert_array_equal(read_image("out/matched_left.png"), left)
+
+
+def test_a_rectified_pair_s_maps_have_their_left_picture_beside_them(folder):
+    left, right = (read_image(TEXTURED / name) for name in ("left.png", "right.png"))
+    write_image("left.png", np.ascontiguousarray(left[:-12]))
+    write_image("right.png", np.ascontiguousarray(right[12:]))
+    _, notes = make_depth(PICTURES, Path("out"), PLAIN)
+    assert any(str(note).startswith("rectified: ") for note in notes)
+    matched = read_image("out/matched_left.png")
+    assert matched.shape == left[:-12].shape
+    assert not np.array_equal(matched, left[:-12])
+
+
 def test_the_occlusion_mask_is_white_where_only_the_left_camera_sees(folder, matcher):
     make_depth(PICTURES, Path("out"), PLAIN)
     estimate = matcher.estimate(read_image("left.png"), read_image("right.png"))
@@ -131,7 +164,13 @@ def test_metres_without_a_camera_are_refused_before_anything_is_written(folder, 
 
 def test_all_without_a_camera_leaves_out_files_in_metres_with_a_note(folder):
     _, notes = make_depth(PICTURES, Path("out"), DepthJob(files=("all",)))
-    assert names_in("out") == {*ALWAYS, "disparity_scaled.png", "disparity.npy", "disparity.tiff"}
+    assert names_in("out") == {
+        *ALWAYS,
+        "disparity_scaled.png",
+        "disparity.npy",
+        "disparity.tiff",
+        "matched_left.png",
+    }
     assert [note for note in notes if "(calibration, focal_px, baseline_m)" in str(note)] != []
 
 

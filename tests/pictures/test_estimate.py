@@ -8,6 +8,7 @@ import pytest
 import stereoweave as sw
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.images import read_pair, write_image
+from stereoweave.learn.data.collage import paint_collage
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 DOWN_PX = 12
@@ -45,14 +46,28 @@ def test_a_view_of_an_aligned_estimate_shows_the_aligned_pair(lower):
 def test_the_estimate_says_how_the_pair_was_aligned(lower, example):
     (note,) = sw.estimate(*lower, align="auto").notes
     assert str(note).startswith("rectified: rows are off by ")
+    assert "no_rectify" not in str(note)
     assert sw.estimate(*lower).notes == ()
     swapped = sw.estimate(example.right, example.left, align="auto")
     assert list(map(str, swapped.notes)) == ["left and right were swapped, and have been swapped back"]
 
 
+def test_the_estimate_says_which_problems_remain(example):
+    other = paint_collage(77, 0, 2, *example.left.shape[:2]).right
+    (unrelated,) = sw.estimate(example.left, other, align="auto").notes
+    assert "different scenes" in str(unrelated)
+    (same,) = sw.estimate(example.left, example.left, align="auto").notes
+    assert str(same).startswith("left and right show the same view")
+    plain = np.full((64, 96, 3), 90, np.uint8)
+    (doubtful,) = sw.estimate(plain, plain, align="auto").notes
+    assert str(doubtful).endswith("not be rectified; give pictures that are rectified by a calibration")
+    assert sw.estimate(example.left, example.left).notes == ()
+
+
 def test_a_sound_pair_gives_the_same_with_and_without_alignment(example):
     aligned = sw.estimate(example.left, example.right, align="auto")
     assert aligned.pair is None
+    assert aligned.notes == ()
     np.testing.assert_array_equal(aligned.disparity_px, sw.estimate(example.left, example.right).disparity_px)
 
 
