@@ -11,9 +11,11 @@ from stereoweave.cameras.rig import format_size
 from stereoweave.errors import FormatError, StereoweaveError
 
 _FEWEST_CORNERS = 8
-# A glance at a board: in a copy of at most this width, for boards of at least this many corners a side, since
-# parts of other patterns look like smaller ones.
-_GLANCE_WIDTH_PX, _GLANCE_CORNERS = 960, 4
+# A board is sought in a copy of at most this many pixels, because a search of a large picture takes seconds.
+_SEARCHED_PX = 1_000_000
+# Another board than the printed one has at least this many corners a side, since parts of other patterns look
+# like smaller ones.
+_GLANCE_CORNERS = 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,14 +126,14 @@ def find_pair_corners(
 def glance_at_chessboard(image: UInt8[np.ndarray, "h w"], board: Board) -> tuple[int, int] | None:
     """Return the columns and rows of the chessboard that a picture seems to show, the more numerous first.
 
-    This takes about a twentieth of the time of `find_pair_corners` and may miss a board. None if no board is
-    found.
+    This takes less time than `find_pair_corners` and may miss a small board. None if no board is found.
     """
-    scale = min(1.0, _GLANCE_WIDTH_PX / image.shape[1])
-    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    # A smaller board than the printed one is found as a part of it, so the printed one is sought first.
-    for least in ((board.columns, board.rows), (_GLANCE_CORNERS, _GLANCE_CORNERS)):
-        flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
+    small, _ = _scale_down(image)
+    # A smaller board than the printed one is found as a part of it, so the printed one is sought first. Only
+    # it is sought exhaustively: a part of another pattern must not look like a board.
+    printed = (board.columns, board.rows), cv2.CALIB_CB_EXHAUSTIVE
+    for least, more in (printed, ((_GLANCE_CORNERS, _GLANCE_CORNERS), 0)):
+        flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER | more
         found, _, marks = cv2.findChessboardCornersSBWithMeta(small, least, flags)
         if found:
             return max(marks.shape), min(marks.shape)
@@ -139,12 +141,48 @@ def glance_at_chessboard(image: UInt8[np.ndarray, "h w"], board: Board) -> tuple
 
 
 def _find_chessboard(image: UInt8[np.ndarray, "h w"], board: Board) -> ViewCorners | None:
-    size, flags = (board.columns, board.rows), cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
+    """Find the corners in a small copy of the picture, then precisely in the part of it around them."""
+    small, scale = _scale_down(image)
+    at_px = _search(small, board, cv2.CALIB_CB_ACCURACY)
+    if scale < 1:
+        if at_px is None:  # the board may be too small for the copy
+            at_px, scale = _search(image, board), 1.0
+        if at_px is None:
+            return None
+        at_px = _find_precisely(image, at_px / scale, board)
+    return None if at_px is None else ViewCorners(np.arange(board.columns * board.rows), at_px)
+
+
+def _search(image: UInt8[np.ndarray, "h w"], board: Board, flags: int = 0) -> Float[np.ndarray, "n 2"] | None:
+    """Return the places of all corners of a chessboard; None if they are not found."""
     for more in (0, cv2.CALIB_CB_EXHAUSTIVE):
-        found, at_px = cv2.findChessboardCornersSB(image, size, flags=flags | more)
+        found, at_px = cv2.findChessboardCornersSB(
+            image, (board.columns, board.rows), flags=cv2.CALIB_CB_NORMALIZE_IMAGE | flags | more
+        )
         if found:
-            return ViewCorners(np.arange(board.columns * board.rows), at_px.reshape(-1, 2).astype(np.float64))
+            return at_px.reshape(-1, 2).astype(np.float64)
     return None
+
+
+def _find_precisely(
+    image: UInt8[np.ndarray, "h w"], near_px: Float[np.ndarray, "n 2"], board: Board
+) -> Float[np.ndarray, "n 2"] | None:
+    """Find the corners of a chessboard to a fraction of a pixel, given where they are about."""
+    # The outer squares lie around the corners; the farther ones of a tilted board are smaller.
+    margin_px = 2 * np.ptp(near_px, axis=0).max() / (min(board.columns, board.rows) - 1)
+    left, top = np.maximum(near_px.min(axis=0) - margin_px, 0).astype(int)
+    right, bottom = np.ceil(near_px.max(axis=0) + margin_px).astype(int)
+    part = np.ascontiguousarray(image[top:bottom, left:right])
+    at_px = _search(part, board, cv2.CALIB_CB_ACCURACY)
+    return None if at_px is None else at_px + (left, top)
+
+
+def _scale_down(image: UInt8[np.ndarray, "h w"]) -> tuple[UInt8[np.ndarray, "h2 w2"], float]:
+    """Return the picture at a size that is soon searched, and that size divided by the picture's."""
+    scale = min(1.0, float(np.sqrt(_SEARCHED_PX / image.size)))
+    if scale == 1.0:
+        return image, scale
+    return cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), scale
 
 
 def _find_charuco(image: UInt8[np.ndarray, "h w"], board: Board) -> ViewCorners | None:

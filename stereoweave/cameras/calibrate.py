@@ -3,6 +3,7 @@
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,8 +23,9 @@ FEWEST_PAIRS = 5
 # A pair with an error of more than this many times the median has a misdetected corner or was taken in
 # motion.
 _OUTLIER = 3.0
-# Number of pairs that are looked at before the search, and of pictures that must show the same other board.
-_GLANCES, _AGREEING_GLANCES = 6, 3
+# Number of pairs that are looked at before the search, of pictures that must show the same other board, and
+# of pictures without any board that suffice.
+_GLANCES, _AGREEING_GLANCES, _EMPTY_GLANCES = 6, 3, 8
 _GOOD_PX, _FAIR_PX = 0.5, 1.0
 _GOOD_COVER_PERCENT, _FAIR_COVER_PERCENT = 60, 40
 _GOOD_PAIRS, _GOOD_TILT_DEGREES = 10, 15
@@ -84,7 +86,8 @@ class Calibration:
         if not faults:
             return f"good: {summary}"
         poor = any(is_poor for is_poor, _ in faults)
-        return f"{'poor' if poor else 'fair'}: {summary}; " + "; ".join(fault for _, fault in faults)
+        # The faults follow the verdict at once: the error may be small in a poor calibration.
+        return f"{'poor' if poor else 'fair'}: {'; '.join(fault for _, fault in faults)} ({summary})"
 
     def _find_faults(self) -> Iterator[tuple[bool, str]]:
         """Yield for each fault whether it makes the calibration poor, and its description with a remedy."""
@@ -151,7 +154,7 @@ def calibrate(
     """
     pairs, left_out = find_pairs(Path(folder))
     if not board.dictionary:
-        _check_count_of_corners(list(pairs.values()), board)
+        _check_board(list(pairs.values()), board)
     seen, size_px = _find_all_corners(pairs, board, left_out)
     _check_enough(len(seen), len(pairs), board, left_out)
     solve = _solve_fisheye if fisheye else _solve_pinhole
@@ -176,29 +179,39 @@ def calibrate(
         _check_enough(len(seen), len(pairs), board, left_out)
 
 
-def _check_count_of_corners(pairs: Sequence[tuple[Path, Path]], board: Board) -> None:
-    """Raise a StereoweaveError if a glance at some pictures shows a board with other numbers of corners.
+def _check_board(pairs: Sequence[tuple[Path, Path]], board: Board) -> None:
+    """Raise a StereoweaveError if a glance at some pictures shows no board, or one with other corners.
 
-    A search for the wrong board in all pictures would take minutes, because it tries everything.
+    A search for a board in all pictures would take minutes where there is none, because it tries everything.
     """
     found: Counter[tuple[int, int] | None] = Counter()
     chosen = np.unique(np.linspace(0, len(pairs) - 1, _GLANCES).round().astype(int))
-    for index in chosen:
-        for path in pairs[index]:
-            try:
+    # The first ones are spread over the folder as well, because a few may suffice.
+    paths = [path for index in (*chosen[::2], *chosen[1::2]) for path in pairs[index]]
+    with step("looking at the pictures", total=len(paths)) as advance:
+        for path in paths:
+            with suppress(FormatError):
                 image = cv2.cvtColor(read_image(path), cv2.COLOR_RGB2GRAY)
-            except FormatError:
-                continue
-            sides = glance_at_chessboard(image, board)
-            if sides == board.sides:
-                return
-            found[sides] += 1
-    found.pop(None, None)
+                sides = glance_at_chessboard(image, board)
+                if sides == board.sides:
+                    return
+                found[sides] += 1
+            advance(1)
+            if found[None] == found.total() == _EMPTY_GLANCES:
+                break
+    looked, empty = found.total(), found.pop(None, 0)
     sides, count = next(iter(found.most_common(1)), (None, 0))
     if sides is not None and count >= _AGREEING_GLANCES and 2 * count > found.total():
         raise StereoweaveError(
-            f"expected {board}, found one of {sides[0]}x{sides[1]} in {count} of {2 * len(chosen)} pictures; "
+            f"expected {board}, found one of {sides[0]}x{sides[1]} in {count} of {len(paths)} pictures; "
             "count the inner corners, where four squares meet",
+            setting="board",
+        )
+    if looked == len(paths) or empty == _EMPTY_GLANCES:
+        raise StereoweaveError(
+            f"expected {board}, found none in {looked} of {2 * len(pairs)} pictures, spread over the folder; "
+            "take sharp pictures with the whole board in both views, and name the marker dictionary of a "
+            "ChArUco board",
             setting="board",
         )
 

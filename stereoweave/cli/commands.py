@@ -10,6 +10,7 @@ from typing import Any, ParamSpec
 import typer
 from typer.core import TyperCommand
 
+from stereoweave.cli.stopping import stopping_orderly
 from stereoweave.errors import NameOf, StereoweaveError, keyword
 
 Given = ParamSpec("Given")
@@ -71,9 +72,9 @@ def running_options() -> NameOf:
 
 
 def shows_steps(command: Callable[Given, None]) -> Callable[Given, None]:
-    """Make a command show its steps on stderr, and compile kernels ahead of their use.
+    """Make a command show its steps on stderr, compile kernels ahead of their use, and stop in order.
 
-    See `progress.show_steps` and `compiling_ahead.compile_ahead`.
+    See `progress.show_steps`, `compiling_ahead.compile_ahead` and `stopping.stopping_orderly`.
     """
 
     @functools.wraps(command)
@@ -81,7 +82,7 @@ def shows_steps(command: Callable[Given, None]) -> Callable[Given, None]:
         # It imports rich, for which --help need not wait.
         from stereoweave.system.progress import show_steps
 
-        with show_steps():
+        with stopping_orderly(), show_steps():
             from stereoweave.system.compiling_ahead import compiling_ahead
 
             with compiling_ahead():

@@ -38,12 +38,14 @@ def run(commands: Commands, program: str, arguments: Sequence[str] | None) -> in
     """Run a command line, and return its exit code: 2 after an error reported in one line on stderr."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # like stderr, for file names that are not UTF-8
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    # A program of one command has no name of a command before its arguments.
+    has_names = len(commands.registered_commands) > 1
     try:
-        return commands(arguments, prog_name=program, standalone_mode=False) or 0
+        given = words or (["--help"] if has_names else [])
+        return commands(given, prog_name=program, standalone_mode=False) or 0
     except typer.TyperException as error:
-        words = sys.argv[1:] if arguments is None else arguments
-        # A program of one command has no name of a command before its arguments.
-        command = words[0] if words and len(commands.registered_commands) > 1 else None
+        command = words[0] if words and has_names else None
         message = describe_misuse(error, program, command)
     except (StereoweaveError, OSError) as error:
         message = str(error)

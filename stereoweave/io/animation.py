@@ -17,8 +17,11 @@ from stereoweave.io.images import checking_format_size
 Frames = Iterator[UInt8[np.ndarray, "h w 3"]]
 
 
-def write_animation(path: str | Path, frames: Iterable[UInt8[np.ndarray, "h w 3"]], frame_ms: int) -> None:
+def write_animation(path: str | Path, frames: Iterable[UInt8[np.ndarray, "h w 3"]], frame_ms: int) -> int:
     """Write frames as an animation, in the format given by the file extension: .mp4, .gif or .webp.
+
+    Return the number of frames in the file. GIF and WebP merge frames that hardly differ into a longer one,
+    so a file in which nothing moves has a single frame.
 
     GIF and WebP files repeat forever; all the frames are held in memory while such a file is written. An MP4
     file plays once and is written frame by frame; if its width or height is odd, the last column or row is
@@ -36,7 +39,7 @@ def write_animation(path: str | Path, frames: Iterable[UInt8[np.ndarray, "h w 3"
     write = _KINDS[check_animation_ending(path)]
     alike = _check_sizes(frames)
     with replacing(path) as temporary:
-        write(temporary, alike, frame_ms)
+        return write(temporary, alike, frame_ms)
 
 
 def check_animation_ending(path: str | Path) -> str:
@@ -85,7 +88,7 @@ def _check_size(first: UInt8[np.ndarray, "h w 3"], frame: UInt8[np.ndarray, "h2 
     return frame
 
 
-def _write_mp4(path: Path, frames: Frames, frame_ms: int) -> None:
+def _write_mp4(path: Path, frames: Frames, frame_ms: int) -> int:
     import av
     from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
 
@@ -98,13 +101,16 @@ def _write_mp4(path: Path, frames: Frames, frame_ms: int) -> None:
         # Without these tags in the file, players guess the colour space from the size, and colours shift.
         context.colorspace, context.color_range = Colorspace.ITU709, ColorRange.MPEG
         context.color_primaries, context.color_trc = ColorPrimaries.BT709, ColorTrc.BT709
+        count = 0
         for frame in chain([first], map(_pad_to_even, frames)):
+            count += 1
             picture = av.VideoFrame.from_ndarray(frame, format="rgb24")
             in_yuv = picture.reformat(
                 format="yuv420p", dst_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.MPEG
             )
             film.mux(stream.encode(in_yuv))
         film.mux(stream.encode())
+    return count
 
 
 def _pad_to_even(frame: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
@@ -112,26 +118,30 @@ def _pad_to_even(frame: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 
     return np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), "edge")
 
 
-def _write_gif(path: Path, frames: Frames, frame_ms: int) -> None:
+def _write_gif(path: Path, frames: Frames, frame_ms: int) -> int:
     """Write a GIF with the first frame's palette for all frames, as separate palettes would cause flicker."""
     pictures = (Image.fromarray(frame) for frame in frames)
     first = next(pictures)
     # Pillow's most accurate and fastest method: 39.1 dB on the example; MEDIANCUT has 35.2 dB; both dithered.
     palette = first.quantize(256, method=Image.Quantize.FASTOCTREE)
-    _save(path, "GIF", (picture.quantize(palette=palette) for picture in chain([first], pictures)), frame_ms)
+    return _save(
+        path, "GIF", (picture.quantize(palette=palette) for picture in chain([first], pictures)), frame_ms
+    )
 
 
-def _write_webp(path: Path, frames: Frames, frame_ms: int) -> None:
-    _save(path, "WEBP", (Image.fromarray(frame) for frame in frames), frame_ms, quality=90, method=4)
+def _write_webp(path: Path, frames: Frames, frame_ms: int) -> int:
+    return _save(path, "WEBP", (Image.fromarray(frame) for frame in frames), frame_ms, quality=90, method=4)
 
 
-def _save(path: Path, kind: str, pictures: Iterator[Image.Image], frame_ms: int, **options: int) -> None:
+def _save(path: Path, kind: str, pictures: Iterator[Image.Image], frame_ms: int, **options: int) -> int:
     first = next(pictures)
     with checking_format_size(path, (first.height, first.width)):
         first.save(path, kind, save_all=True, append_images=pictures, duration=frame_ms, loop=0, **options)
+    with Image.open(path, formats=[kind]) as file:
+        return int(getattr(file, "n_frames", 1))
 
 
-_KINDS: dict[str, Callable[[Path, Frames, int], None]] = {
+_KINDS: dict[str, Callable[[Path, Frames, int], int]] = {
     ".mp4": _write_mp4,
     ".gif": _write_gif,
     ".webp": _write_webp,

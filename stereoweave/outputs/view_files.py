@@ -151,9 +151,11 @@ class ViewFile:
         motion = ANIMATIONS[name]
         turns = motion.turns(self.path)
         frames = render_views(renderer, motion.positions * turns)
-        write_animation(self.path, (_cut(frame, part) for frame in frames), motion.frame_ms)
-        count = len(motion.positions) * turns
-        return WrittenView(f"{name}, {count} frames in {count * motion.frame_ms / 1000:g} s")
+        count = write_animation(self.path, (_cut(frame, part) for frame in frames), motion.frame_ms)
+        if count == 1:
+            return WrittenView(f"{name}, a still picture, because nothing moves in it")
+        length_s = len(motion.positions) * turns * motion.frame_ms / 1000
+        return WrittenView(f"{name}, {count} frames in {length_s:g} s")
 
     def _write_viewer(
         self, pair: StereoPair, estimate: Estimate, plane_px: float, pictures: Iterable[Path]

@@ -1,7 +1,9 @@
 import csv
 import json
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -228,6 +230,32 @@ def test_the_installed_command_reports_a_mistake_in_one_line(mistakes):
     assert done.stdout == ""
     assert len(done.stderr.splitlines()) == 1
     assert "half.png" in done.stderr
+
+
+def test_the_name_alone_shows_the_help(capsys):
+    assert main([]) == 0
+    told = capsys.readouterr()
+    assert told.out.startswith("Usage: stereoweave [OPTIONS] COMMAND") and told.err == ""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_stopped_command_says_so_and_leaves_nothing(tmp_path, number):
+    pictures = [REPOSITORY / "examples" / f"{eye}.png" for eye in ("left", "right")]
+    program = (
+        # As in a terminal: a shell that starts the tests in the background lets them ignore Ctrl-C.
+        "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
+        "signal.signal(signal.SIGHUP, signal.SIG_DFL); "
+        "from stereoweave.cli.root import main; sys.exit(main())"
+    )
+    command = [sys.executable, "-c", program, "depth", *pictures, "-o", tmp_path / "out"]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    while not any(tmp_path.iterdir()) and process.poll() is None:
+        time.sleep(0.01)
+    assert process.poll() is None
+    process.send_signal(number)
+    assert process.communicate(timeout=60)[1].splitlines()[-1] == "stereoweave: stopped"
+    assert process.returncode == 128 + number
+    assert [path for path in tmp_path.rglob("*") if path.name.startswith(".stereoweave-")] == []
 
 
 @pytest.mark.parametrize("kind", ["grey", "grey of 16 bits", "RGBA"])

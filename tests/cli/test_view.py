@@ -104,6 +104,14 @@ def test_the_extension_of_a_file_can_select_the_layout(pair):
         assert np.abs(np.asarray(file)[:, :95].astype(int) - pair.right).mean() < 3
 
 
+def test_a_wiggle_of_equal_pictures_is_not_called_moving(pair, capfd):
+    words = "--layout wiggle --convergence 0 --model small --threads 1 --no-rectify"
+    assert run(f"view left.png left.png {words} -o v.webp") == 0
+    with Image.open("v.webp") as file:
+        assert file.n_frames == 1
+    assert capfd.readouterr().out.startswith("v.webp: wiggle, a still picture, because nothing moves in it\n")
+
+
 @pytest.mark.parametrize("ending", [".gif", ".webp", ".mp4"])
 def test_a_wiggle_moves(pair, capfd, ending):
     # At convergence 0, because at the wall's own disparity, the wall would stay in place in all frames.

@@ -182,3 +182,11 @@ def test_an_mp4_without_pyav_names_the_extra_before_a_frame_is_rendered(tmp_path
         write_animation(tmp_path / "a.mp4", never(), 40)
     assert list(tmp_path.iterdir()) == []
     assert check_animation_ending("a.gif") == ".gif"
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_the_number_of_frames_in_the_file_is_returned(tmp_path, moving, ending):
+    path = tmp_path / f"a{ending}"
+    count = write_animation(path, [moving[0]] * 5, 60)
+    assert count == len(read_again(path)) == (5 if ending == ".mp4" else 1)
+    assert write_animation(path, moving, 60) == 7
