@@ -98,5 +98,9 @@ def test_a_spatial_photo_alone_gives_metres(testdata):
 
 @pytest.mark.usefixtures("without_shape_checks")
 def test_an_image_alone_is_no_pair(example):
-    with pytest.raises(StereoweaveError, match="expected a right image besides a left one that is no path"):
+    with pytest.raises(StereoweaveError) as caught:
         sw.estimate(example.left)
+    assert str(caught.value) == (
+        "right: expected a right image besides a left one that is no path, found None; "
+        "give it, or the path of one file with both views"
+    )
