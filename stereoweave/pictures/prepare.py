@@ -106,6 +106,7 @@ def prepare(pictures: Sequence[Path], request: Request) -> Prepared:
 
 
 def _is_new(pictures: Sequence[Path], opened: StereoPair, ready: StereoPair) -> bool:
+    """Return whether the left picture to match is in no file (see `Prepared`)."""
     return len(pictures) == 1 or ready.left is not opened.left
 
 
