@@ -213,11 +213,12 @@ def _look_behind(
     behind_px[find_speckles(behind_px)] = NOTHING
     places = np.indices(front_px.shape, np.float32)
     v, u = places[0] - rows, places[1] - columns
-    inside_px = np.where(front_px < -NOTHING, front_px, NOTHING)
-    beside = (behind_px == NOTHING) & (_measure_step_px(inside_px) > SAME_SURFACE_PX)
+    inside = front_px < -NOTHING
+    step_px = _measure_step_px(np.where(inside, front_px, NOTHING))
+    beside = inside & (behind_px == NOTHING) & (step_px > SAME_SURFACE_PX)
     met_px = np.where(pure, right_px, NOTHING)
     met_px = cv2.remap(met_px, u - front_px, v, cv2.INTER_NEAREST, borderValue=[float(NOTHING)])
-    beside &= abs(met_px - inside_px) <= OCCLUSION_STEP_PX
+    beside &= abs(met_px - front_px) <= OCCLUSION_STEP_PX
     behind_px[beside] = front_px[beside]
     looks = match_exposure(pair.left, pair.right, estimate)
     right = recolour(pair.right, looks.tables(0)[1]) if looks else pair.right

@@ -42,7 +42,8 @@ def find_nearest(
     """Return row and column of the kept pixel nearest to each pixel; its own if no pixel is kept."""
     rows, columns = np.nonzero(kept)
     if not len(rows):
-        return tuple(np.indices(kept.shape))
+        rows, columns = np.mgrid[: kept.shape[0], : kept.shape[1]]
+        return rows, columns
     _, labels = cv2.distanceTransformWithLabels(
         (~kept).view(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
     )
