@@ -25,7 +25,7 @@ _MEDIAN_PX = 5
 _PASSES = 3
 # Widths of windows: a narrow part of the layer behind; what is seen together with replaced pixels; the rim of
 # an edge in the right image; the surroundings of an edge in the left one; a gap beyond the borders.
-_NARROW_PX, _NEAR_PX, _RIM_PX, _BESIDE_PX, _GAP_PX = 5, 7, 5, 15, 25
+_NARROW_PX, _NEAR_PX, _RIM_PX, _BESIDE_PX, _GAP_PX = 5, 7, 3, 15, 25
 
 
 @dataclass(frozen=True, kw_only=True)
