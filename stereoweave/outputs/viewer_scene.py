@@ -4,13 +4,16 @@ import base64
 import io
 from typing import Any
 
+import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 from PIL import Image
 
+from stereoweave.rendering.canvas_kernels import SAME_SURFACE_PX
 from stereoweave.rendering.layers import Layers, Reach, make_layers
 from stereoweave.rendering.layouts import median_disparity_px
 from stereoweave.rendering.scaling import fit_size, scale_down
+from stereoweave.rendering.speckles import find_nearer_px
 from stereoweave.stereo import Estimate, StereoPair
 
 POSITIONS = (-0.1, 1.1)
@@ -46,7 +49,8 @@ def pack_scene(  # noqa: PLR0913 - all but the first two are optional
     """Return the scene for `StereoweaveViewer`, which JSON can hold; see `make_viewer` for the arguments.
 
     Images are data: addresses. A disparity map is a lossless WebP: its level, 256 * red + green, is
-    the disparity in units of `code_px[1]` above `code_px[0]`.
+    the disparity in units of `code_px[1]` above `code_px[0]`. Its blue is how many pixels of disparity nearer
+    the surface is whose colour a pixel of the front layer may carry.
     """
     plane_px = median_disparity_px(estimate) if convergence_px is None else convergence_px
     width = pair.left.shape[1]
@@ -164,10 +168,11 @@ def _find_landing(
 
 def _encode_layers(layers: Layers, low_px: float) -> dict[str, str]:
     """Return images and disparities of the layers as addresses, of less than `_MOST_BYTES` in total."""
-    thin_px = layers.behind_px[::_THINNING, ::_THINNING]
+    thin_px = _thin(layers.behind_px)
+    nearer_px = find_nearer_px(layers.front_px)
     depths = {
-        name: _address(_encode_disparity(disparity_px, low_px))
-        for name, disparity_px in (("frontDepth", layers.front_px), ("behindDepth", thin_px))
+        "frontDepth": _address(_encode_disparity(layers.front_px, nearer_px, low_px)),
+        "behindDepth": _address(_encode_disparity(thin_px, 0 * thin_px, low_px)),
     }
     for quality in _FRONT_QUALITIES:
         images = {
@@ -179,9 +184,23 @@ def _encode_layers(layers: Layers, low_px: float) -> dict[str, str]:
     return depths | images
 
 
-def _encode_disparity(disparity_px: Float32[np.ndarray, "h w"], low_px: float) -> UInt8[np.ndarray, "h w 3"]:
+def _thin(disparity_px: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h2 w2"]:
+    """Return every second pixel; beside an edge, the nearer disparity.
+
+    So the farther disparity never comes with the nearer surface's colour.
+    """
+    window = np.ones((_THINNING + 2, _THINNING + 2), np.uint8)
+    around_px = cv2.dilate(disparity_px, window, anchor=(1, 1))
+    thick_px = np.where(around_px - disparity_px > SAME_SURFACE_PX, around_px, disparity_px)
+    return thick_px[::_THINNING, ::_THINNING]
+
+
+def _encode_disparity(
+    disparity_px: Float32[np.ndarray, "h w"], nearer_px: Float32[np.ndarray, "h w"], low_px: float
+) -> UInt8[np.ndarray, "h w 3"]:
     levels = np.rint((disparity_px - low_px) / _STEP_PX).astype(np.int32)
-    return np.dstack([levels >> 8, levels & 255, 0 * levels]).astype(np.uint8)
+    blue = np.clip(np.rint(nearer_px), 0, 255).astype(np.int32)
+    return np.dstack([levels >> 8, levels & 255, blue]).astype(np.uint8)
 
 
 def _address(image: UInt8[np.ndarray, "h w 3"], quality: int | None = None) -> str:

@@ -12,7 +12,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from stereoweave.matching.exposure import match_exposure, recolour
+from stereoweave.matching.left_right_check import OCCLUSION_STEP_PX
 from stereoweave.rendering.canvas_kernels import NOTHING, SAME_SURFACE_PX
+from stereoweave.rendering.speckles import find_nearer_px, find_nearest, find_speckles, remove_speckles
 from stereoweave.stereo import Estimate, StereoPair
 from stereoweave.system.threads import in_bands, thread_count
 
@@ -21,6 +23,9 @@ _FURTHER = 0.25
 _BAND_ROWS = 60
 _MEDIAN_PX = 5
 _PASSES = 3
+# Widths of windows: a narrow part of the layer behind; what is seen together with replaced pixels; the rim of
+# an edge in the right image; the surroundings of an edge in the left one; a gap beyond the borders.
+_NARROW_PX, _NEAR_PX, _RIM_PX, _BESIDE_PX, _GAP_PX = 5, 7, 3, 15, 25
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +85,7 @@ def make_layers(
     """
     front = pair.left
     # Speckles would fly about, and ragged outlines would tear.
-    front_px = cv2.medianBlur(np.ascontiguousarray(estimate.disparity_px, np.float32), _MEDIAN_PX)
+    front_px = remove_speckles(estimate.disparity_px)
     behind, behind_px, invented = _replace_foreground(front, front_px, reach, thread_count(threads))
     columns, rows = margin_px
     sides = (rows, rows, columns, columns)
@@ -92,6 +97,8 @@ def make_layers(
     by_right = seen_px > NOTHING
     behind[by_right], behind_px[by_right] = seen_colours[by_right], seen_px[by_right]
     invented &= ~by_right
+    gaps = (nearest_px == -NOTHING) & ~by_right & _close(by_right)
+    invented |= _mend(behind, behind_px, by_right | invented, gaps)
     # The rows are continued one by one; their median joins them.
     for _ in range(_PASSES):
         for values in (behind, behind_px):
@@ -104,6 +111,30 @@ def make_layers(
         margin_px=margin_px,
         drawn=~invented,
     )
+
+
+def _mend(
+    behind: UInt8[np.ndarray, "h2 w2 3"],
+    behind_px: Float32[np.ndarray, "h2 w2"],
+    replaced: Bool[np.ndarray, "h2 w2"],
+    gaps: Bool[np.ndarray, "h2 w2"],
+) -> Bool[np.ndarray, "h2 w2"]:
+    """Replace what would fly before the background or mar it, and return the mask of where.
+
+    That is the gaps, speckles and narrow parts of the foreground between replaced pixels, and colours beside
+    an edge, which may be the nearer surface's. All get the nearest value that is free of these.
+    """
+    near = cv2.dilate(replaced.view(np.uint8), np.ones((_NEAR_PX, _NEAR_PX), np.uint8)).view(bool)
+    window = np.ones((_NARROW_PX, _NARROW_PX), np.uint8)
+    open_px = cv2.morphologyEx(behind_px, cv2.MORPH_OPEN, window)
+    wrong = gaps | near & (find_speckles(behind_px) | (behind_px - open_px > SAME_SURFACE_PX))
+    rim = near & ~replaced & (find_nearer_px(behind_px) > 0)
+    inner = cv2.morphologyEx(open_px, cv2.MORPH_GRADIENT, window) <= SAME_SURFACE_PX
+    places = find_nearest(inner & ~wrong & ~rim)
+    behind_px[wrong] = behind_px[places][wrong]
+    wrong |= rim
+    behind[wrong] = behind[places][wrong]
+    return wrong
 
 
 def _replace_foreground(
@@ -159,11 +190,15 @@ def _look_behind(
     front_px: Float32[np.ndarray, "h2 w2"],
     margin_px: tuple[int, int],
 ) -> tuple[Float32[np.ndarray, "h2 w2"], UInt8[np.ndarray, "h2 w2 3"]]:
-    """Return disparity (or NOTHING) and colour of what the right image shows behind the front layer."""
+    """Return disparity (or NOTHING) and colour of what the right image shows behind the front layer.
+
+    Beside the front layer's edges, also where the right image shows the front layer itself: the left image's
+    colours there may be the nearer surface's.
+    """
     columns, rows = margin_px
-    right_px = np.ascontiguousarray(estimate.right_disparity_px, np.float32)
-    # A right pixel beside a nearer surface may carry that surface's colour.
-    pure = cv2.dilate(right_px, np.ones((3, 3), np.uint8)) - right_px <= SAME_SURFACE_PX
+    right_px = remove_speckles(estimate.right_disparity_px)
+    # A right pixel near a nearer surface may carry that surface's colour.
+    pure = cv2.dilate(right_px, np.ones((_RIM_PX, _RIM_PX), np.uint8)) - right_px <= SAME_SURFACE_PX
     y, x = np.nonzero(pure)
     order = np.argsort(right_px[y, x], kind="stable")  # the nearest is written last
     y, x = y[order], x[order]
@@ -175,8 +210,27 @@ def _look_behind(
         kept[kept] &= found_px[kept] < front_px[y[kept] + rows, column[kept]] - SAME_SURFACE_PX
         landed = y[kept] + rows, column[kept]
         behind_px[landed] = np.maximum(behind_px[landed], found_px[kept])
+    behind_px[find_speckles(behind_px)] = NOTHING
+    places = np.indices(front_px.shape, np.float32)
+    v, u = places[0] - rows, places[1] - columns
+    inside = front_px < -NOTHING
+    step_px = _measure_step_px(np.where(inside, front_px, NOTHING))
+    beside = inside & (behind_px == NOTHING) & (step_px > SAME_SURFACE_PX)
+    met_px = np.where(pure, right_px, NOTHING)
+    met_px = cv2.remap(met_px, u - front_px, v, cv2.INTER_NEAREST, borderValue=[float(NOTHING)])
+    beside &= abs(met_px - front_px) <= OCCLUSION_STEP_PX
+    behind_px[beside] = front_px[beside]
     looks = match_exposure(pair.left, pair.right, estimate)
     right = recolour(pair.right, looks.tables(0)[1]) if looks else pair.right
-    places = np.indices(front_px.shape, np.float32)
-    v, u = places[0] - rows, places[1] - columns - behind_px
-    return behind_px, cv2.remap(right, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return behind_px, cv2.remap(right, u - behind_px, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+def _measure_step_px(disparity_px: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+    """Return how much nearer the nearest surface beside a pixel is."""
+    return cv2.dilate(disparity_px, np.ones((_BESIDE_PX, _BESIDE_PX), np.uint8)) - disparity_px
+
+
+def _close(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Return the mask with its gaps filled."""
+    window = np.ones((_GAP_PX, _GAP_PX), np.uint8)
+    return cv2.morphologyEx(mask.view(np.uint8), cv2.MORPH_CLOSE, window).view(bool)

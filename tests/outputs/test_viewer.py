@@ -7,6 +7,7 @@ import json
 import re
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -164,6 +165,37 @@ def test_no_view_has_a_gap_or_a_stretched_edge(browser, photo, position, up):
     assert between.mean() < 0.02
 
 
+@pytest.fixture(scope="module")
+def speckled(scene, tmp_path_factory) -> Path:
+    """Write the page of the scene with an estimate in which 200 spots of 1 to 3 px of each map are wrong."""
+    pair, exact = scene
+    rng = np.random.default_rng(5)
+    maps_px = exact.disparity_px.copy(), exact.right_disparity_px.copy()
+    for disparity_px in maps_px:
+        for _ in range(200):
+            row, column, size = rng.integers(40, 140), rng.integers(80, 260), rng.integers(1, 4)
+            disparity_px[row : row + size, column : column + size] = rng.uniform(0, BOX_PX)
+    path = tmp_path_factory.mktemp("speckled") / "photo.html"
+    estimate = replace(exact, disparity_px=maps_px[0], right_disparity_px=maps_px[1])
+    write_viewer(path, make_viewer(pair, estimate, convergence_px=0))
+    return path
+
+
+@pytest.mark.needs_chromium
+@pytest.mark.parametrize(("position", "wide_px"), [(-0.1, 40), (1.1, 60)])
+def test_no_dots_fly_where_the_estimate_is_wrong_in_spots(browser, speckled, scene, position, wide_px):
+    shown = seen_from(open_page(browser, speckled), position)
+    # The nearer camera sees the wall that this end uncovers; its picture is moved to the viewpoint.
+    seen, beyond = (scene[0].right, position - 1) if position > 0.5 else (scene[0].left, position)
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float32)
+    wall = cut(cv2.remap(seen, x + np.float32(beyond * WALL_PX), y, cv2.INTER_LINEAR), speckled)
+    left, top = packed(speckled)["shown_px"][:2]
+    end = round((220 if position > 0.5 else 130) - position * BOX_PX - left)
+    columns = slice(end + 5, end + wide_px) if position > 0.5 else slice(end - wide_px, end - 5)
+    rows = slice(round(40 - top), round(140 - top))
+    assert (difference(shown, wall)[rows, columns] > 50).mean() < 0.001
+
+
 @pytest.mark.needs_chromium
 def test_a_page_opens_offline_and_requests_nothing(browser, photo):
     context = browser.new_context(offline=True)
@@ -215,6 +247,16 @@ def test_a_finger_drags_the_view_on_a_phone(browser, photo):
         points = [] if x is None else [{"x": x, "y": 400}]
         touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
     wait_until(page, "stereoweaveViewer.eye[0] > 0.9")  # 130 px is a third of the width
+    phone.close()
+
+
+@pytest.mark.needs_chromium
+def test_a_finger_can_hit_each_button_of_a_phone(browser, photo):
+    phone = browser.new_context(viewport={"width": 390, "height": 844}, is_mobile=True, has_touch=True)
+    page = open_page(phone, photo)
+    for name in ("Pause motion", "Tilt to look around"):
+        box = page.get_by_role("button", name=name).bounding_box()
+        assert min(box["width"], box["height"]) >= 44
     phone.close()
 
 

@@ -37,11 +37,12 @@ float coverage(vec2 s, float d) {
     vec2 corner = vec2(k == 1 || k == 3 ? 1.0 : 0.0, k > 1 ? 1.0 : 0.0);
     vec2 shares = mix(1.0 - part, part, corner);
     float share = shares.x * shares.y;
-    float apart = frontAt(clamp(first + corner, vec2(0.0), size - 1.0)) - d;
-    if (abs(apart) <= SAME_SURFACE_PX) own += share;
+    vec4 texel = texture2D(frontDepth, (clamp(first + corner, vec2(0.0), size - 1.0) + 0.5) / size);
+    float apart = code.x + code.y * level(texel) - d;
+    if (abs(apart) > SAME_SURFACE_PX) lost += share * clamp(stretch * abs(apart), 0.0, 1.0);
     else {
-      lost += share * clamp(stretch * abs(apart), 0.0, 1.0);
-      if (apart > 0.0 && share > 0.001) impure = max(impure, clamp(stretch * apart - 1.0, 0.0, 1.0));
+      own += share;
+      if (share > 0.001) impure = max(impure, clamp(stretch * texel.b * 255.0 - 1.0, 0.0, 1.0));
     }
   }
   return own < 0.25 ? 0.0 : clamp(1.0 - 2.0 * lost, 0.0, 1.0) * (1.0 - impure);
@@ -72,17 +73,26 @@ vec3 findFront(vec2 p, float low, float high, float steps) {
   return vec3(NOTHING, 0.0, 1.0);
 }
 
-// Disparity of the layer behind, which has no gaps.
-float findBehind(vec2 p, float low, float high, float steps) {
-  float stride = (high - low) / steps, above = 0.0;
-  for (int i = 0; i <= MOST_STEPS; i++) {
+// Where the line meets the layer behind: its disparity there, and the surface's. A line that passes behind a nearer
+// part of the layer goes on; what it would meet there is unknown, so it gets the farther surface beside that part.
+vec2 findBehind(vec2 p, float low, float high, float steps) {
+  float stride = (high - low) / steps;
+  float slack = SAME_SURFACE_PX * max(1.0, length(eye) * stride);
+  float before = behindAt(p + eye * (high - plane));
+  if (before >= high) return vec2(high);
+  vec2 beside = vec2(NOTHING);
+  for (int i = 1; i <= MOST_STEPS; i++) {
     if (float(i) > steps) break;
     float d = high - stride * float(i);
-    float below = behindAt(p + eye * (d - plane)) - d;
-    if (below >= 0.0) return i == 0 ? d : d + stride * below / (below - above);
-    above = below;
+    float here = behindAt(p + eye * (d - plane));
+    float above = before - d - stride, below = here - d;
+    if (above < 0.0 && below >= 0.0 && here - before <= slack) return vec2(d + stride * below / (below - above), here);
+    if (above < 0.0 && below >= 0.0 && (beside.y == NOTHING || before < beside.y)) beside = vec2(d + stride, before);
+    if (above >= 0.0 && below >= 0.0 && (below <= stride || before - here > slack))
+      return beside.y > NOTHING && beside.y < here ? beside : vec2(d, here);
+    before = here;
   }
-  return low;
+  return beside.y > NOTHING ? beside : vec2(low);
 }
 
 void main() {
@@ -93,9 +103,9 @@ void main() {
   vec3 found = findFront(p, low, high, steps);
   vec3 colour = texture2D(front, (p + eye * (found.x - plane) + 0.5) / size).rgb;
   if (found.y < 1.0 || found.z > 0.0) {
-    float d = findBehind(p, low, high, steps);
-    vec3 further = texture2D(behind, behindPlace(p + eye * (d - plane))).rgb;
-    bool covered = found.z > 0.0 && d > found.x + SAME_SURFACE_PX;
+    vec2 met = findBehind(p, low, high, steps);
+    vec3 further = texture2D(behind, behindPlace(p + eye * (met.x - plane))).rgb;
+    bool covered = found.z > 0.0 && met.y > found.x + SAME_SURFACE_PX;
     colour = mix(further, colour, covered ? 0.0 : found.y);
   }
   gl_FragColor = vec4(colour, 1.0);
