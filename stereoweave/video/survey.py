@@ -219,7 +219,10 @@ def _select_common_notes(defects: Sequence[list[Note]]) -> list[Note]:
     frames.
     """
     some = [notes for notes in defects if notes]
-    return some[-1] if 2 * len(some) > len(defects) else []
+    if 2 * len(some) <= len(defects):
+        return []
+    where = "" if len(some) == len(defects) else "in most of the video: "
+    return [replace(note, text=where + note.text) for note in some[-1]]
 
 
 def _find_swapped_packing(frame_packing: str | None) -> str | None:
