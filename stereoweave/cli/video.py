@@ -8,7 +8,6 @@ import typer
 
 from stereoweave.cli.commands import running_options, shows_steps
 from stereoweave.cli.options import (
-    Model,
     OldFormat,
     Provider,
     Strength,
@@ -38,7 +37,8 @@ Out = Annotated[
     typer.Option(
         "--out",
         "-o",
-        help="Video to write: .mp4, .mov or .mkv. Rerun the same command to resume after an interruption.",
+        help="Video to write: .mp4, .mov or .mkv. Rerun the same command to resume after an "
+        "interruption, which loses at most 4 s of video.",
     ),
 ]
 Depth = Annotated[
@@ -96,6 +96,10 @@ Preview = Annotated[
         "long the whole video would take.",
     ),
 ]
+VideoModel = Annotated[
+    str,
+    typer.Option(help="Shipped network: small, or base, which is slower; or an .onnx matcher file."),
+]
 
 
 RectifyShots = Annotated[
@@ -121,7 +125,7 @@ def video(  # noqa: PLR0913 - each is an option of the command line
     rate: Rate = None,
     rectify: RectifyShots = True,
     preview: Preview = None,
-    model: Model = "small",
+    model: VideoModel = "small",
     threads: Threads = None,
     provider: Provider = "cpu",
     arrangement: OldFormat = None,
@@ -135,7 +139,7 @@ def video(  # noqa: PLR0913 - each is an option of the command line
     from stereoweave.video.reader import open_video
 
     with require_video_extra("a video"):
-        from stereoweave.video.convert import convert_video
+        from stereoweave.video.convert import PART_S, convert_video
         from stereoweave.video.job import VideoJob
         from stereoweave.video.parts import parts_folder
 
@@ -162,7 +166,7 @@ def video(  # noqa: PLR0913 - each is an option of the command line
         make_parent_folder(out)
         tally = convert_video(source, videos, out, job, Console(stderr=True))
     except KeyboardInterrupt:
-        _print_stopped(out, parts_folder(out))
+        _print_stopped(out, parts_folder(out), PART_S)
         raise typer.Exit(130) from None
     _print_tally(out, tally)
     if length_s is not None and tally.frames_per_s:
@@ -212,17 +216,17 @@ def _add_mark(out: Path, layout: str, size_px: tuple[int, int]) -> Path:
     return add_mark(out, layout, StereoPair(left=blank, right=blank), LayoutOptions())
 
 
-def _print_stopped(out: Path, folder: Path) -> None:
-    state = "no part was finished"
+def _print_stopped(out: Path, folder: Path, part_s: int) -> None:
+    state = f"no part of {part_s} s was finished; the same command starts from the beginning"
     if folder.exists():
         state = f"finished parts are in {folder}; rerun the same command to resume"
     typer.echo(f"stereoweave: {out}: stopped; {state}", err=True)
 
 
 def _print_tally(out: Path, tally: "VideoTally") -> None:
-    cuts = "1 cut" if tally.cuts == 1 else f"{tally.cuts} cuts"
+    cuts = {0: "", 1: ", 1 cut"}.get(tally.cuts, f", {tally.cuts} cuts")
     frames = "1 frame" if tally.frames == 1 else f"{tally.frames} frames"
-    typer.echo(f"{out}: {frames}, {cuts}")
+    typer.echo(f"{out}: {frames}{cuts}")
     if tally.problems:
         more = "; ..." if tally.problems > len(tally.named) else ""
         typer.echo(f"problems in {tally.problems} of {frames}: {'; '.join(tally.named)}{more}")

@@ -29,7 +29,7 @@ from stereoweave.video.tracks import list_picture_files
 from stereoweave.video.writer import GREY16, H264, Packing, Picture, Recorder, check_container
 
 # Length of a part, which begins with a key frame. An interrupted run loses only the unfinished part.
-_PART_S = 10
+PART_S = 4
 
 PACKINGS = {
     "side_by_side": Packing("left_right", 3),
@@ -94,7 +94,7 @@ def convert_video(
         opening = list(islice(frames, 1))  # decodes all frames before it, which is no part of the speed
         meter = _Meter(bar, out.name, video, converter.tally.frames)
         for first in chain(opening, frames):
-            part = islice(chain([first], frames), round(_PART_S * video.rate) or 1)
+            part = islice(chain([first], frames), round(PART_S * video.rate) or 1)
             with parts.next(converter.state) as path, closing(converter.convert(part)) as pictures:
                 recorder.write_part(path, map(meter.count, pictures))
         recorder.join(parts.files, video.sound, out, job.describe_values(converter.survey, video.camera))

@@ -92,7 +92,7 @@ def survey_video(
         samples.append(sample)
         bar.advance(shown)
     defects = [
-        [_add_time(sample.time, note, video) for note in sample.notes]
+        [_name_packing(note, video) for note in sample.notes]
         for sample in samples
         if sample.notes is not None
     ]
@@ -203,24 +203,26 @@ def _spread_evenly(count: int, wanted: int) -> range:
     return range(step // 2, count, step)
 
 
-def _add_time(time: Fraction, note: Note, video: StereoVideo) -> Note:
-    """Return a note with the time of its frame added.
-
-    If the views in a single file are swapped, the remedy names the frame packing with the eyes swapped.
-    """
+def _name_packing(note: Note, video: StereoVideo) -> Note:
+    """Return a note; if the views in a single file are swapped, its remedy names the other frame packing."""
     other = _find_swapped_packing(video.frame_packing)
     if note == SWAPPED and other:
-        note = replace(note, remedy=Remedy(f"choose {other}", ("format",)))
-    return replace(note, text=f"{format_time(time)} {note.text}")
+        return replace(note, remedy=Remedy(f"choose {other}", ("format",)))
+    return note
 
 
 def _select_common_notes(defects: Sequence[list[Note]]) -> list[Note]:
     """Return the notes on the last frame with notes if over half of the frames have notes; otherwise none.
 
-    Notes on fewer frames are unreliable, because a video may begin with black frames.
+    They name no time, because they are about more than that frame: the time of one would read as if the
+    frames before it were sound. Notes on fewer frames are unreliable, because a video may begin with black
+    frames.
     """
     some = [notes for notes in defects if notes]
-    return some[-1] if 2 * len(some) > len(defects) else []
+    if 2 * len(some) <= len(defects):
+        return []
+    where = "" if len(some) == len(defects) else "in most of the video: "
+    return [replace(note, text=where + note.text) for note in some[-1]]
 
 
 def _find_swapped_packing(frame_packing: str | None) -> str | None:

@@ -58,3 +58,9 @@ def test_a_dropped_column_is_noted(tmp_path, matcher, painted):
     odd = np.hstack([*painted, painted[1][:, :1]])
     film = write_video(tmp_path / "film_SBS.mkv", [odd] * 2, codec="ffv1")
     assert survey_notes(film, matcher) == ["the last column is dropped, because the width, 641 px, is odd"]
+
+
+def test_a_note_on_most_frames_names_no_time(tmp_path, matcher, painted):
+    film = write_side_by_side(tmp_path / "film_SBS.mkv", [painted[::-1]] * 3)
+    (line,) = survey_notes(film, matcher)
+    assert line == "left and right were swapped, and have been swapped back"
