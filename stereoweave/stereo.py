@@ -85,18 +85,16 @@ class StereoCamera:
             return self.focal_px * self.baseline_m / depth_m - self.doffs_px
 
 
-def assume_camera(
-    size_px: tuple[int, int], *, baseline_m: float = 1.0, doffs_px: float = 0.0
-) -> StereoCamera:
+def assume_camera(size_px: tuple[int, int], *, doffs_px: float = 0.0) -> StereoCamera:
     """Return a plausible camera for images of this width and height, whose own camera is unknown.
 
-    It has a horizontal field of view of 53 degrees, as a focal length of 36 mm gives on 35 mm film, and its
-    optical axis passes through the centre.
+    It has a baseline of 1 m and a horizontal field of view of 53 degrees, as a focal length of 36 mm gives on
+    35 mm film, and its optical axis passes through the centre.
     """
     width, height = size_px
     return StereoCamera(
         focal_px=width,
-        baseline_m=baseline_m,
+        baseline_m=1.0,
         cx_px=(width - 1) / 2,
         cy_px=(height - 1) / 2,
         doffs_px=doffs_px,

@@ -52,9 +52,9 @@ ERRORS = {
     "setting, and give the left picture first": lambda: open_pictures(PAIR, "crossed"),
     "turned.yml: expected a calibration of rectified pictures, found lenses with distortion; rectify "
     "the pair with it (rectify)": lambda: prepare(PAIR, Request(calibration=Path("turned.yml"))),
-    "metres: expected a baseline besides the focal length, found none in EXIF; give the baseline "
+    "metres: expected a baseline besides the focal length, found none in metadata; give the baseline "
     "(baseline_m)": (lambda: prepare(PAIR, Request(focal_px=500))),
-    "metres: expected a focal length besides the baseline, found none in EXIF; give the focal length "
+    "metres: expected a focal length besides the baseline, found none in metadata; give the focal length "
     "(focal_px)": lambda: prepare(PAIR, Request(baseline_m=0.1)),
     "rectify: expected at least 40 feature matches that agree on the camera positions, found 0 of 0 "
     "matches; photograph a scene with more texture and with more overlap; or give a calibration "

@@ -283,7 +283,10 @@ class PairTab:
                 await self._host.work(request, work, progress)
             except (StereoweaveError, OSError) as error:
                 return self._wording.format_error(error)
-        return format_frame(file.read_text(encoding="utf-8"), title="Report")
+        try:
+            return format_frame(file.read_text(encoding="utf-8"), title="Report")
+        except OSError:  # it has expired meanwhile
+            return format_paragraphs([_GONE])
 
     def _measure_click(
         self, session: Session | None, clicks: list[tuple[int, int]], event: gr.SelectData

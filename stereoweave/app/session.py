@@ -26,14 +26,8 @@ from stereoweave.rendering.scaling import fit_size, scale_down
 from stereoweave.stereo import Estimate, StereoPair
 
 _LONGER_SIDE_PX = 1280
-_MOST_POINTS = 300_000
-# Multiple of the median depth. The viewer fits all points into view, so a few points on a far horizon would
-# shrink the rest to a dot.
-_FARTHEST = 4.0
 # Files up to this total size, reached at about 8 megapixels, are stored twice: individually and in the zip.
 _MOST_ZIPPED_BYTES = 300 * 1024**2
-# Distance between human eyes.
-_EYES_M = 0.065
 # The files that everyone can open.
 _SHOWN_FIRST = ("report.html", "preview.png")
 _NO_METRES = "For metres, give a calibration file, or the focal length and the baseline."

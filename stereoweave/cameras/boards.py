@@ -140,6 +140,14 @@ def glance_at_chessboard(image: UInt8[np.ndarray, "h w"], board: Board) -> tuple
     return None
 
 
+def shows_chessboard(image: UInt8[np.ndarray, "h w"], board: Board) -> bool:
+    """Return whether a chessboard is found at full size, by a search that is not exhaustive."""
+    found, _ = cv2.findChessboardCornersSB(
+        image, (board.columns, board.rows), flags=cv2.CALIB_CB_NORMALIZE_IMAGE
+    )
+    return bool(found)
+
+
 def _find_chessboard(image: UInt8[np.ndarray, "h w"], board: Board) -> ViewCorners | None:
     """Find the corners in a small copy of the picture, then precisely in the part of it around them."""
     small, scale = _scale_down(image)
@@ -149,7 +157,8 @@ def _find_chessboard(image: UInt8[np.ndarray, "h w"], board: Board) -> ViewCorne
             at_px, scale = _search(image, board), 1.0
         if at_px is None:
             return None
-        at_px = _find_precisely(image, at_px / scale, board)
+        precise_px = _find_precisely(image, at_px / scale, board)
+        at_px = _search(image, board, cv2.CALIB_CB_ACCURACY) if precise_px is None else precise_px
     return None if at_px is None else ViewCorners(np.arange(board.columns * board.rows), at_px)
 
 

@@ -12,7 +12,13 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from stereoweave.cameras.boards import Board, PairCorners, find_pair_corners, glance_at_chessboard
+from stereoweave.cameras.boards import (
+    Board,
+    PairCorners,
+    find_pair_corners,
+    glance_at_chessboard,
+    shows_chessboard,
+)
 from stereoweave.cameras.rig import Optics, Rig, Size, format_size
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io.decoding import ENDINGS
@@ -188,6 +194,7 @@ def _check_board(pairs: Sequence[tuple[Path, Path]], board: Board) -> None:
     chosen = np.unique(np.linspace(0, len(pairs) - 1, _GLANCES).round().astype(int))
     # The first ones are spread over the folder as well, because a few may suffice.
     paths = [path for index in (*chosen[::2], *chosen[1::2]) for path in pairs[index]]
+    image = None
     with step("looking at the pictures", total=len(paths)) as advance:
         for path in paths:
             with suppress(FormatError):
@@ -207,7 +214,8 @@ def _check_board(pairs: Sequence[tuple[Path, Path]], board: Board) -> None:
             "count the inner corners, where four squares meet",
             setting="board",
         )
-    if looked == len(paths) or empty == _EMPTY_GLANCES:
+    # A board that is too small for a glance is found at full size.
+    if empty == looked and (image is None or not shows_chessboard(image, board)):
         raise StereoweaveError(
             f"expected {board}, found none in {looked} of {2 * len(pairs)} pictures, spread over the folder; "
             "take sharp pictures with the whole board in both views, and name the marker dictionary of a "

@@ -1,5 +1,6 @@
 """From two pictures to an estimate in one call: `stereoweave.estimate`."""
 
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -61,9 +62,11 @@ def estimate(  # noqa: PLR0913 - all but the images are keyword-only and optiona
     backend = Backend(model=model, threads=threads, provider=provider)
     if right is None:
         prepared = _open_both(left, aligned=bool(align))
-        return replace(
-            match(backend.matcher(), prepared.pair, options), pair=prepared.pair, notes=prepared.notes
-        )
+        found = match(backend.matcher(), prepared.pair, options)
+        notes = _fit_to_python(prepared.notes)
+        if align:
+            notes += tuple(find_problems(prepared.pair, found, prepared.alignment, _RECTIFY_FIRST))
+        return replace(found, pair=prepared.pair, notes=notes)
     given = StereoPair(left=as_rgb(left, "left"), right=as_rgb(right, "right"))
     matcher = backend.matcher()
     if not align:
@@ -71,7 +74,7 @@ def estimate(  # noqa: PLR0913 - all but the images are keyword-only and optiona
     aligned = auto_align.align(given)
     found = match(matcher, aligned.pair, options)
     notes = (
-        *map(_fit_to_python, aligned.notes),
+        *_fit_to_python(aligned.notes),
         *find_problems(aligned.pair, found, aligned.alignment, _RECTIFY_FIRST),
     )
     return replace(found, pair=None if aligned.pair is given else aligned.pair, notes=notes)
@@ -88,6 +91,10 @@ def _open_both(file: ImageLike, *, aligned: bool) -> Prepared:
     return prepare([Path(file)], Request(rectify=None if aligned else False))
 
 
-def _fit_to_python(note: Note) -> Note:
-    """Return the note without a remedy that undoes the alignment, which the caller has asked for."""
-    return replace(note, remedy=None) if note.remedy == auto_align.KEEP else note
+def _fit_to_python(notes: Iterable[Note]) -> tuple[Note, ...]:
+    """Return notes without the remedies that name settings which `estimate` does not have."""
+    lacking = {"no_rectify", "format"}
+    return tuple(
+        replace(note, remedy=None) if note.remedy and lacking & set(note.remedy.settings) else note
+        for note in notes
+    )

@@ -139,12 +139,12 @@ def _find_camera(
         return camera, (Note(f"from {lens.source}: {', '.join(read)}"),) if read else ()
     if request.focal_px is not None:
         raise StereoweaveError(
-            "metres: expected a baseline besides the focal length, found none in EXIF",
+            "metres: expected a baseline besides the focal length, found none in metadata",
             remedy=Remedy("give the baseline", ("baseline_m",)),
         )
     if request.baseline_m is not None:
         raise StereoweaveError(
-            "metres: expected a focal length besides the baseline, found none in EXIF",
+            "metres: expected a focal length besides the baseline, found none in metadata",
             remedy=Remedy("give the focal length", ("focal_px",)),
         )
     return None, ()
@@ -185,7 +185,7 @@ def _drop_camera_without_doffs(ready: _Ready) -> _Ready:
         return replace(ready, alignment=alignment)
     text = (
         f"no depth in metres: {alignment.negative_percent:.0f} % of the matches have negative disparities, "
-        "as from converged cameras, whose doffs are not in EXIF"
+        "as from converged cameras, whose doffs are not in metadata"
     )
     return _Ready(
         pair=replace(pair, camera=None),

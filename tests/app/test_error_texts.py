@@ -38,12 +38,12 @@ ERRORS: dict[str, tuple[dict[str, str], dict[str, Any]]] = {
     "right.png; omit this setting, and give the left picture first": (PAIR, {"layout": "crossed"}),
     "turned.yml: expected a calibration of rectified pictures, found lenses with distortion; rectify the "
     "pair with it (“Align the pictures”)": ({**PAIR, "calibration": "turned.yml"}, {"rectify": False}),
-    "metres: expected a baseline besides the focal length, found none in EXIF; give the baseline "
+    "metres: expected a baseline besides the focal length, found none in metadata; give the baseline "
     "(“Baseline, mm”)": (
         PAIR,
         {"focal": 500},
     ),
-    "metres: expected a focal length besides the baseline, found none in EXIF; give the focal length "
+    "metres: expected a focal length besides the baseline, found none in metadata; give the focal length "
     "(“Focal length, px”)": (PAIR, {"baseline": 100}),
     "expected a left and a right picture, or one file with both views, found none; drop them on the form, or "
     "try the sample": ({}, {}),

@@ -28,9 +28,9 @@ ERRORS = {
     f"depth {PAIR} --calib turned.yml -o out": "turned.yml: expected a calibration of rectified pictures, "
     "found lenses with distortion; rectify the pair with it (--rectify)",
     f"depth {PAIR} --focal-px 500 -o out": "metres: expected a baseline besides the focal length, "
-    "found none in EXIF; give the baseline (--baseline-m)",
+    "found none in metadata; give the baseline (--baseline-m)",
     f"depth {PAIR} --baseline-m 0.1 -o out": "metres: expected a focal length besides the "
-    "baseline, found none in EXIF; give the focal length (--focal-px)",
+    "baseline, found none in metadata; give the focal length (--focal-px)",
     "view plain.png plain.png --rectify -o out.png": "--rectify: expected at least 40 feature matches "
     "that agree on the camera positions, found 0 of 0 matches; photograph a scene with more "
     "texture and with more overlap; or give a calibration (--calib)",

@@ -12,8 +12,8 @@ from stereoweave.pictures.prepare import Request, prepare
 TEXTURED = Path(__file__).resolve().parents[1] / "textured_pair"
 BY_PX = 30
 NO_DOFFS = (
-    " % of the matches have negative disparities, as from converged cameras, whose doffs are not in EXIF; "
-    "give a calibration with doffs (calibration)"
+    " % of the matches have negative disparities, as from converged cameras, whose doffs are not in "
+    "metadata; give a calibration with doffs (calibration)"
 )
 
 

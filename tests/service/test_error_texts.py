@@ -32,7 +32,7 @@ ERRORS: dict[str, tuple[str, dict[str, str], dict[str, Any]]] = {
     "and give the left picture first": ("/disparity", PAIR, {"format": "crossed"}),
     "calib: expected a calibration of rectified pictures, found lenses with distortion; rectify the pair "
     "with it (rectify)": ("/disparity", {**PAIR, "calib": "turned.yml"}, {}),
-    "metres: expected a baseline besides the focal length, found none in EXIF; give the baseline "
+    "metres: expected a baseline besides the focal length, found none in metadata; give the baseline "
     "(baseline_m)": (
         "/depth",
         PAIR,
