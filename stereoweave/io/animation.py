@@ -11,6 +11,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from stereoweave.errors import StereoweaveError, require_extra
+from stereoweave.io.decoding import count_frames
 from stereoweave.io.files import replacing
 from stereoweave.io.images import checking_format_size
 
@@ -137,8 +138,7 @@ def _save(path: Path, kind: str, pictures: Iterator[Image.Image], frame_ms: int,
     first = next(pictures)
     with checking_format_size(path, (first.height, first.width)):
         first.save(path, kind, save_all=True, append_images=pictures, duration=frame_ms, loop=0, **options)
-    with Image.open(path, formats=[kind]) as file:
-        return int(getattr(file, "n_frames", 1))
+    return count_frames(path)
 
 
 _KINDS: dict[str, Callable[[Path, Frames, int], int]] = {

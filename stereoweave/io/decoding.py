@@ -245,6 +245,12 @@ def _refuse_by_content(path: Path, picture: Any, views: int) -> None:
         )
 
 
+def count_frames(path: Path) -> int:
+    """Return the number of frames of an animation, or 1. Raises FormatError."""
+    with _decoding(path), Image.open(path, formats=_KINDS) as picture:
+        return _count_frames(path, picture)
+
+
 def _count_frames(path: Path, picture: Any) -> int:
     """Return the number of frames of an animation, or 1; other formats hold other pictures in more frames."""
     if picture.format not in _ANIMATIONS:

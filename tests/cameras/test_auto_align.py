@@ -136,7 +136,7 @@ def test_cameras_that_are_stated_to_be_parallel_keep_every_disparity(painted, le
     np.testing.assert_allclose(left_px, taken.left_px, atol=1e-6)
     np.testing.assert_allclose(right_px[:, 0], taken.right_px[:, 0], atol=1e-6)
     assert [str(note).partition("; ")[2] for note in aligned.notes] == [
-        "rows were bent; keep the pictures as they are (no_rectify)"
+        "rows were bent; the pictures can also be kept as they are (no_rectify)"
     ]
 
 

@@ -249,7 +249,7 @@ def test_a_stopped_command_says_so_and_leaves_nothing(tmp_path, number):
     )
     command = [sys.executable, "-c", program, "depth", *pictures, "-o", tmp_path / "out"]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    while not any(tmp_path.iterdir()) and process.poll() is None:
+    while not any(tmp_path.glob(".stereoweave-*/*")) and process.poll() is None:
         time.sleep(0.01)
     assert process.poll() is None
     process.send_signal(number)

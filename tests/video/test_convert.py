@@ -412,7 +412,7 @@ def test_a_damaged_frame_is_reported_with_its_time_and_does_not_end_the_video(tm
         ("out.mp4", ["--depth", "--rate", "1/0"], "--rate: expected frames per second"),
         ("out.mp4", ["--depth", "--rate", "-5"], "--rate: expected frames per second"),
         ("out.mp4", ["--depth", "--rate", "1e300"], "at most 1000, such as 24 or 30000/1001, found '1e300'"),
-        ("out.mp4", ["--depth", "--rate", ""], "--rate: expected frames per second"),
+        ("out.mp4", ["--depth", "--rate", ""], "found an empty one; is a variable unset?"),
         ("out.mp4", ["--depth", "--preview", "soon"], "--preview: expected seconds above 0, such as 5s, "),
         ("out.mp4", ["--depth", "--preview", "0s"], "--preview: expected seconds above 0, such as 5s, "),
     ],
