@@ -43,10 +43,9 @@ def _to_xyz(x: float, y: float) -> np.ndarray:
 
 def _write_profile(name: str, matrix: np.ndarray) -> bytes:
     """Return an ICC profile, version 4, of a display whose primaries are the columns of an XYZ matrix."""
-    text = name.encode("utf-16-be")
-    described = b"mluc" + struct.pack(">LLL2s2sLL", 0, 1, 12, b"en", b"US", len(text), 28) + text
     curve = b"para" + struct.pack(">LHH", 0, 3, 0) + _pack_fixed(*_SRGB_CURVE)
-    tags = {b"desc": described, b"cprt": described, b"wtpt": b"XYZ " + bytes(4) + _pack_fixed(*_D50)}
+    tags = {b"desc": _pack_text(name), b"cprt": _pack_text("No copyright, use freely")}
+    tags[b"wtpt"] = b"XYZ " + bytes(4) + _pack_fixed(*_D50)
     for letter, column in zip((b"r", b"g", b"b"), matrix.T, strict=True):
         tags[letter + b"XYZ"] = b"XYZ " + bytes(4) + _pack_fixed(*column)
         tags[letter + b"TRC"] = curve
@@ -58,6 +57,11 @@ def _write_profile(name: str, matrix: np.ndarray) -> bytes:
     head = struct.pack(">L4sL4s4s4s", start + len(body), bytes(4), 0x04000000, b"mntr", b"RGB ", b"XYZ ")
     head += struct.pack(">6H", 2026, 1, 1, 0, 0, 0) + b"acsp" + bytes(28) + _pack_fixed(*_D50)
     return head.ljust(128, b"\0") + table + body
+
+
+def _pack_text(words: str) -> bytes:
+    text = words.encode("utf-16-be")
+    return b"mluc" + struct.pack(">LLL2s2sLL", 0, 1, 12, b"en", b"US", len(text), 28) + text
 
 
 def _pack_fixed(*values: float) -> bytes:

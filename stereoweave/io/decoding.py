@@ -78,7 +78,9 @@ def open_picture(path: Path, *, views: int = 1, expected: str = A_PICTURE) -> It
     with _decoding(path, expected):
         picture = heif.open_heif(path) if is_heif else _open(path, path, views)
     with picture:
-        check_size(path, picture.size, views=views)
+        # The sizes of all pictures: Pillow allocates memory when it seeks one.
+        for size_px in (picture.size, *(heif.read_sizes(path) if is_heif else ())):
+            check_size(path, size_px, views=views)
         _refuse_by_content(path, picture, views)
         yield picture
 

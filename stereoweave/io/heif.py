@@ -5,6 +5,7 @@ disparity adjustment, so these are read here from the file's boxes (ISO/IEC 1449
 """
 
 import math
+import re
 import struct
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -12,7 +13,7 @@ from typing import Any, NamedTuple
 
 from PIL import Image
 
-from stereoweave.errors import FormatError, StereoweaveError, require_extra
+from stereoweave.errors import FormatError, Remedy, StereoweaveError, require_extra
 from stereoweave.io import exif
 
 BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"})
@@ -21,7 +22,13 @@ FORMAT = "HEIF"  # Pillow's name for an open picture's format
 _STEREO_GROUP = "ster"
 # libheif holds the whole file in memory. Those of 48 megapixels take about 20 MB.
 _MOST_BYTES = 500_000_000
-_MOST_META_BYTES = 4_000_000
+# pillow-heif copies the EXIF data and the colour profile of each picture, even if they share one, when it
+# opens a file. A profile lies in the box `meta`. A spatial photo of 2560x2560 px has a `meta` of 4 kB, with 2
+# pictures and their 50 hidden tiles.
+_MOST_META_BYTES = 1_000_000
+_MOST_PICTURES = 20
+_MOST_BOXES = 1000  # on the top level of a file
+_OTHER_ITEMS = frozenset({b"Exif", b"mime", b"uri "})
 # Cameras write the first of these boxes by its identifier, as drafts of the standard did.
 _EXTRINSICS = (bytes.fromhex("4363e9145b7d4aab97aebea69803b434"), b"cmex")
 # Apple's box: a signed number, ten-thousandths of the picture's width.
@@ -44,7 +51,8 @@ def open_heif(path: Path) -> Image.Image:
     """Open a HEIC picture at its primary image, without decoding it.
 
     Raises:
-        FormatError: pillow-heif is not installed, or the file is larger than 500 MB.
+        FormatError: pillow-heif is not installed, the file is larger than 500 MB, or its box `meta` is
+            missing, larger than 1 MB, or lists more than 20 pictures beside hidden ones.
         Exception: The file is damaged; pillow-heif raises SyntaxError, ValueError and others.
     """
     try:
@@ -58,7 +66,22 @@ def open_heif(path: Path) -> Image.Image:
             f"{path}: expected a HEIC picture of at most {_MOST_BYTES // 1_000_000} MB, "
             f"found {size_bytes // 1_000_000} MB; scale it down"
         )
+    _check_meta(path, _read_meta(path))
     return HeifImageFile(path)
+
+
+def read_sizes(path: Path) -> list[tuple[int, int]]:
+    """Return the widths and heights in pixels of all pictures and tiles, as the file states them."""
+    parts = _split_boxes(_read_meta(path)[4:])
+    shared = (
+        _split_boxes(part) for kind, content in parts if kind == b"iprp" for _, part in _split_boxes(content)
+    )
+    return [
+        struct.unpack_from(">LL", content, 4)
+        for properties in shared
+        for kind, content in properties
+        if kind == b"ispe" and len(content) >= 12
+    ]
 
 
 def find_views(picture: Any) -> list[int]:
@@ -102,6 +125,29 @@ def read_lens(path: Path, picture: Any) -> exif.Lens | None:
         source="the HEIC file",
     )
     return lens if lens.is_known else None
+
+
+def _check_meta(path: Path, meta: bytes) -> None:
+    """Raise a FormatError if the contents of the box `meta` are missing, or list too many pictures."""
+    if not meta:
+        raise FormatError(
+            f"{path}: expected a HEIC picture with one box 'meta', found none or several",
+            remedy=Remedy("copy it again"),
+        )
+    # All entries, wherever they are: a search by boxes would miss those that only libheif finds.
+    entries = [meta[found.end() : found.end() + 14] for found in re.finditer(b"infe", meta)]
+    count = sum(_is_visible_picture(entry) for entry in entries)
+    if count > _MOST_PICTURES:
+        raise FormatError(
+            f"{path}: expected a HEIC file of at most {_MOST_PICTURES} pictures, found {count}; "
+            "save its two views as separate pictures"
+        )
+
+
+def _is_visible_picture(entry: bytes) -> bool:
+    """Tell whether an item is a picture that is not hidden, as tiles are, from the content of its `infe`."""
+    kind = entry[10:14] if entry[:1] == b"\3" else entry[8:12]  # identifiers of 32 bits, or of 16
+    return len(kind) == 4 and not entry[3] & 1 and kind not in _OTHER_ITEMS
 
 
 def _find_stereo_group(picture: Any) -> dict[str, Any] | None:
@@ -163,27 +209,48 @@ def _split_boxes(content: bytes) -> Iterator[_Box]:
     start = 0
     while start + 8 <= len(content):
         size, kind = struct.unpack_from(">L4s", content, start)
-        head, end = (24 if kind == b"uuid" else 8), (start + size if size else len(content))
-        if end < start + head or end > len(content):
+        begin = start + 8
+        if size == 1:
+            size, begin = int.from_bytes(content[begin : begin + 8]), begin + 8
+        if kind == b"uuid":
+            kind, begin = content[begin : begin + 16], begin + 16
+        end = start + size if size else len(content)
+        if end < begin or end > len(content):
             return
-        yield (content[start + 8 : start + 24] if head == 24 else kind), content[start + head : end]
+        yield kind, content[begin:end]
         start = end
 
 
 def _read_meta(path: Path) -> bytes:
-    """Return the contents of a file's box `meta`, of at most 4 MB; empty if there is none."""
+    """Return the contents of a file's box `meta`; empty if there is none, or several.
+
+    Of several, which the standard rules out, libheif may use another one.
+
+    Raises:
+        FormatError: The box is larger than 1 MB.
+    """
+    found = b""
     with path.open("rb") as file:
         end = path.stat().st_size
-        while file.tell() < end:
+        for _ in range(_MOST_BOXES):
             start = file.tell()
+            if start == end:
+                return found
             head = file.read(16)
             size, kind, long_size = struct.unpack(">L4sQ", head.ljust(16, b"\0"))
             begin = 16 if size == 1 else 8
             size = long_size if size == 1 else size or end - start
             if size < begin or start + size > end:
-                break
+                return b""
             if kind == b"meta":
+                if found:
+                    return b""
+                if size > _MOST_META_BYTES:
+                    raise FormatError(
+                        f"{path}: expected a HEIC picture whose box 'meta' is at most 1 MB, found "
+                        f"{size / 1e6:.1f} MB; save it again without its colour profile"
+                    )
                 file.seek(start + begin)
-                return file.read(min(size - begin, _MOST_META_BYTES))
+                found = file.read(size - begin)
             file.seek(start + size)
     return b""

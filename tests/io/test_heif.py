@@ -1,5 +1,6 @@
 """HEIC pictures: which views are read, their colours and orientation, and the cameras of spatial photos."""
 
+import io
 import struct
 import sys
 from contextlib import suppress
@@ -11,13 +12,14 @@ import pillow_heif
 import pytest
 from heic_examples import LOSSLESS, write_heic
 from picture_examples import DISPLAY_P3, profile, refusal_of
-from PIL import Image, ImageOps
+from PIL import Image, ImageCms, ImageOps
 from video_examples import shrunk
 
 from stereoweave.cameras.alignment import check_pair
 from stereoweave.errors import FormatError
 from stereoweave.io import heif
-from stereoweave.io.decoding import read_picture
+from stereoweave.io.colour_profiles import make_profile
+from stereoweave.io.decoding import open_picture, read_picture
 from stereoweave.io.images import read_image
 from stereoweave.pictures.loading import open_pictures, pixel_factor
 from stereoweave.pictures.pair_finding import find_pairs_in
@@ -302,6 +304,13 @@ def test_colours_stated_in_numbers_are_converted(tmp_path, primaries, curve, sto
     assert decoded.note == f"colours converted from {name}"
 
 
+def test_a_profile_of_colours_in_numbers_has_a_copyright_of_its_own(tmp_path, pair):
+    with open_picture(write_heic(tmp_path / "a.heic", pair.left, color_primaries=12)) as picture:
+        stored = ImageCms.ImageCmsProfile(io.BytesIO(make_profile(picture.info["nclx_profile"])))
+    assert ImageCms.getProfileDescription(stored).strip() == "Display P3"
+    assert ImageCms.getProfileCopyright(stored).strip() == "No copyright, use freely"
+
+
 def test_without_pillow_heif_the_error_names_the_extra(tmp_path, pair, monkeypatch):
     path = write_heic(tmp_path / "a.heic", pair.left, pair.right)
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
@@ -319,6 +328,68 @@ def test_an_enormous_file_is_refused_unread(tmp_path):
         file.write(b"\0\0\0\x18ftypheic\0\0\0\0mif1heic")
         file.truncate(600_000_000)
     assert "expected a HEIC picture of at most 500 MB, found 600 MB" in refusal_of(read_image, path)
+
+
+# Hostile files
+
+
+def test_a_file_of_more_than_twenty_pictures_is_refused_before_it_is_opened(tmp_path, monkeypatch):
+    small = np.zeros((64, 64, 3), np.uint8)
+    most = write_heic(tmp_path / "most.heic", *[small] * 20)
+    assert read_image(most).shape == (64, 64, 3)
+    path = write_heic(tmp_path / "a.heic", *[small] * 21)
+    monkeypatch.setattr(pillow_heif, "HeifImageFile", None)
+    refusal = refusal_of(read_image, path)
+    assert "expected a HEIC file of at most 20 pictures, found 21; save its two views as" in refusal
+
+
+def test_hidden_pictures_and_metadata_do_not_count(tmp_path):
+    small = np.zeros((64, 64, 3), np.uint8)
+    tags = Image.Exif()
+    tags[ORIENTATION] = 1
+    path = write_heic(tmp_path / "a.heic", *[small] * 21, exif=tags)
+    content = path.read_bytes()
+    last = content.rindex(b"hvc1") - 12
+    assert content[last : last + 8] == b"infe\2\0\0\0"
+    path.write_bytes(content[: last + 7] + b"\1" + content[last + 8 :])
+    assert read_image(path).shape == (64, 64, 3)
+
+
+def test_pictures_that_share_a_large_profile_are_refused_before_they_are_opened(tmp_path, monkeypatch):
+    small = np.zeros((64, 64, 3), np.uint8)
+    path = write_heic(tmp_path / "a.heic", *[small] * 20, icc_profile=bytes(3_000_000))
+    monkeypatch.setattr(pillow_heif, "HeifImageFile", None)
+    refusal = refusal_of(read_image, path)
+    assert "expected a HEIC picture whose box 'meta' is at most 1 MB, found 3.0 MB; save it" in refusal
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_a_second_box_of_pictures_is_refused(tmp_path, pair, first):
+    path = write_heic(tmp_path / "a.heic", pair.left)
+    content = path.read_bytes()
+    start = content.index(b"meta") - 4
+    end = start + int.from_bytes(content[start : start + 4])
+    at = start if first else len(content)
+    path.write_bytes(content[:at] + content[start:end] + content[at:])
+    assert "expected a HEIC picture with one box 'meta', found none or several" in refusal_of(
+        read_image, path
+    )
+
+
+def test_endless_boxes_are_not_followed(tmp_path):
+    content = of_boxes(pose(0), pose(1, 64_000), box(b"free"))
+    few, many = box(b"free") * 900, box(b"free") * 1000
+    assert lens_of(tmp_path / "few.heic", few + content).baseline_m == pytest.approx(0.064)
+    assert lens_of(tmp_path / "many.heic", many + content) is None
+
+
+def test_a_view_of_enormous_size_is_refused_before_memory_is_allocated(tmp_path, pair):
+    path = write_heic(tmp_path / "a.heic", pair.left, pair.right[:96, :96])
+    stated = b"ispe" + bytes(4) + struct.pack(">LL", 96, 96)
+    enormous = b"ispe" + bytes(4) + struct.pack(">LL", 12_000, 11_000)
+    changed(path, path, (stated, enormous))
+    refusal = refusal_of(lambda path: open_pictures([path]), path)
+    assert "expected at most 130 megapixels, found 12000x11000; scale it down" in refusal
 
 
 # Damaged files
