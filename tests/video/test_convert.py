@@ -102,7 +102,7 @@ def test_depth_in_16_bits_is_disparity_times_256(tmp_path):
 def test_a_spatial_video_is_converted_with_its_times_sound_and_metres(tmp_path, capsys):
     assert run(SPATIAL, tmp_path / "out.mkv", "--depth16", "--threads", "2") == 0
     said = capsys.readouterr()
-    assert said.out == f"{tmp_path / 'out.mkv'}: 50 frames, 0 cuts\n"
+    assert said.out == f"{tmp_path / 'out.mkv'}: 50 frames\n"
     assert "spatial video (MV-HEVC), left view first: field of view 60 degrees" in said.err
     assert times_of(tmp_path / "out.mkv") == [Fraction(index, 25) for index in range(50)]
     assert [body for _, body in packets(tmp_path / "out.mkv", "audio")] == [
