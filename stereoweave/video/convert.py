@@ -91,13 +91,14 @@ def convert_video(
             for note in [*notes, *job.find_losses(survey)]:
                 _print_line(console, note.format(job.name_of))
         frames = video.frames(converter.tally.frames)
-        opening = list(islice(frames, 1))  # decodes all frames before it, which is no part of the speed
+        opening = list(islice(frames, 1))  # decodes from a key frame on, which is no part of the speed
         meter = _Meter(bar, out.name, video, converter.tally.frames)
         for first in chain(opening, frames):
             part = islice(chain([first], frames), round(PART_S * video.rate) or 1)
             with parts.next(converter.state) as path, closing(converter.convert(part)) as pictures:
                 recorder.write_part(path, map(meter.count, pictures))
-        recorder.join(parts.files, video.sound, out, job.describe_values(converter.survey, video.camera))
+        said = job.describe_values(converter.survey, video.camera, rectified=converter.has_warped)
+        recorder.join(parts.files, video.sound, out, said)
     return replace(converter.tally, frames_per_s=meter.frames_per_s)
 
 

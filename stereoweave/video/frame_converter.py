@@ -108,6 +108,11 @@ class FrameConverter:
             **self._grouper.state(),
         }
 
+    @property
+    def has_warped(self) -> bool:
+        """Whether any frame was rectified so far; then the camera that the video declares no longer holds."""
+        return self._grouper.has_warped
+
     def convert(self, frames: Iterable[StereoFrame]) -> Generator[tuple[Fraction, Picture]]:
         """Yield the time in seconds and the output image of each frame.
 

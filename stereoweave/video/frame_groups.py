@@ -56,6 +56,11 @@ class FrameGrouper:
             for frame in several:
                 yield FrameGroup([frame], [self._begin(frame)])
 
+    @property
+    def has_warped(self) -> bool:
+        """Whether any frame was warped so far."""
+        return self._aligner is not None and self._aligner.has_warped
+
     def state(self) -> dict[str, np.ndarray]:
         """Return the complete state as arrays; a restored grouper gives the same results."""
         kept = {} if self._last_grey is None else {"last_grey": self._last_grey}

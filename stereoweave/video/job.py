@@ -16,6 +16,7 @@ from stereoweave.video.survey import Survey
 from stereoweave.video.writer import Picture
 
 _STEPS_PER_PX, _MOST_GREY16_PX = 256, 255.99
+_NO_METRES = "no depth in metres, because frames were rectified"
 
 # Keys of the saved settings that identify the input and the version, and their names in error messages.
 _SAVED_FACTS = {"film": "video", "stereoweave": "stereoweave"}
@@ -129,21 +130,26 @@ class VideoJob:
         )
         return [Note(text, Remedy("show all of them in colours", ("depth",)))]
 
-    def describe_values(self, survey: Survey, camera: StereoCamera | None = None) -> dict[str, str]:
+    def describe_values(
+        self, survey: Survey, camera: StereoCamera | None = None, *, rectified: bool = False
+    ) -> dict[str, str]:
         """Return metadata for the output file that explains how pixel values encode disparity.
 
-        With a camera, it also explains their depth in metres.
+        With a camera, it also explains their depth in metres, or says that rectified frames have none: their
+        rectification turns the cameras, which shifts the disparity of infinitely far points.
         """
+        ending = f"; {_NO_METRES}" if camera and rectified else ""
+        camera = None if rectified else camera
         low_px, high_px = survey.range_px
         if self.depth16:
             text = f"16-bit grey: disparity of the left view in pixels = value / {_STEPS_PER_PX}"
             if camera:
                 constant = camera.focal_px * camera.baseline_m * _STEPS_PER_PX
                 text += f"; depth in metres = {constant:.6g} / value"
-            return {"comment": text}
+            return {"comment": text + ending}
         if self.depth:
             low, high = (_describe_disparity(value_px, camera) for value_px in survey.range_px)
-            return {"comment": f"disparity of the left view: {low} is blue, {high} is red"}
+            return {"comment": f"disparity of the left view: {low} is blue, {high} is red{ending}"}
         if self.layout == "rgbd":
             return {"comment": f"disparity in grey: {low_px:.2f} px is black, {high_px:.2f} px is white"}
         return {}

@@ -20,9 +20,13 @@ class ShotAligner:
 
     Args:
         swapped: Whether left and right are swapped in the whole video.
+
+    Attributes:
+        has_warped: Whether any frame was warped, so that the camera of the frames as read no longer holds.
     """
 
     def __init__(self, *, swapped: bool = False) -> None:
+        self.has_warped = False
         self._swapped, self._measured = swapped, False
         self._warps: Warps | None = None
 
@@ -32,7 +36,10 @@ class ShotAligner:
         if not self._measured:
             aligned = align_rows(pair)
             self._measured, self._warps = aligned.alignment.is_known, aligned.warps
-        return _warp(pair, self._warps) if self._warps else pair
+        if not self._warps:
+            return pair
+        self.has_warped = True
+        return _warp(pair, self._warps)
 
     def begin_shot(self) -> None:
         """Measure the next frame."""
@@ -40,7 +47,7 @@ class ShotAligner:
 
     def state(self) -> dict[str, np.ndarray]:
         """Return the complete state as arrays; a restored aligner gives the same results."""
-        kept = {"aligner": np.array([self._swapped, self._measured])}
+        kept = {"aligner": np.array([self._swapped, self._measured, self.has_warped])}
         for side in Warps._fields if self._warps else ():
             warp: PictureWarp = getattr(self._warps, side)
             kept[f"{side}_homography"] = warp.homography
@@ -52,9 +59,9 @@ class ShotAligner:
     @classmethod
     def from_state(cls, state: Mapping[str, np.ndarray]) -> "ShotAligner":
         """Restore an aligner from a saved `state`."""
-        swapped, measured = state["aligner"].tolist()
+        swapped, measured, has_warped = state["aligner"].tolist()
         aligner = cls(swapped=swapped)
-        aligner._measured = measured
+        aligner._measured, aligner.has_warped = measured, has_warped
         if "left_homography" in state:
             aligner._warps = Warps(*(_restore_warp(state, side) for side in Warps._fields))
         return aligner

@@ -1,6 +1,7 @@
 """Spatial video (MV-HEVC), which holds each view in a layer of its own; what it says about its cameras."""
 
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from math import radians, tan
 from typing import TYPE_CHECKING, Any
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
 # the frames of a video with several layers.
 _VIEW_ID = 29
 _UNNAMED = 28, _VIEW_ID, 30, 31
+# AVStereo3D: nine numbers of 4 bytes, to which later versions of FFmpeg may add.
+_STEREO3D_BYTES = 36
 # AVStereo3DView and AVSphericalProjection.
 _RIGHT, _UNSPECIFIED_VIEWS = 2, (0, 3)
 _RECTILINEAR = 4
@@ -120,16 +123,12 @@ def read_stereo3d(frame: "av.VideoFrame") -> Stereo3D | None:
     """Return what a frame says about its views and cameras; None if it says nothing."""
     from av.sidedata.sidedata import Type
 
-    # The type stubs of PyAV lack some kinds of side data.
-    try:
-        side_data: Any = frame.side_data
-    except ValueError:  # a kind of side data that PyAV does not know
-        [named] = _filtered(frame, *(f"mode=delete:type={kind}" for kind in _UNNAMED))
-        side_data = named.side_data
-    if Type.STEREO3D not in side_data:
+    side_data = _read_side_data(frame)
+    stereo3d = bytes(side_data.get(Type.STEREO3D, b""))
+    if len(stereo3d) < _STEREO3D_BYTES:
         return None
     kind, flags, view, _, baseline_um, shift, shift_unit, angle, angle_unit = np.frombuffer(
-        bytes(side_data[Type.STEREO3D]), np.int32
+        stereo3d[:_STEREO3D_BYTES], np.int32
     ).tolist()
     said = Stereo3D(kind, bool(flags & 1), view)
     if _is_panorama(side_data.get(Type.SPHERICAL)):
@@ -142,29 +141,44 @@ def read_stereo3d(frame: "av.VideoFrame") -> Stereo3D | None:
     )
 
 
+def _read_side_data(frame: "av.VideoFrame") -> Any:
+    """Return a frame's side data by type; {} if one of them has no name in PyAV and FFmpeg's filter."""
+    # The type stubs of PyAV lack some kinds of side data.
+    with suppress(ValueError):
+        return frame.side_data
+    # A kind of side data that PyAV does not know.
+    for named in _filtered(frame, *(f"mode=delete:type={kind}" for kind in _UNNAMED)):
+        with suppress(ValueError):
+            return named.side_data
+    return {}
+
+
 def _is_panorama(spherical: Any) -> bool:
     return spherical is not None and np.frombuffer(bytes(spherical), np.int32, 1)[0] != _RECTILINEAR
 
 
 def _filtered(frame: "av.VideoFrame", *steps: str) -> list["av.VideoFrame"]:
-    """Return the frame after FFmpeg's filter `sidedata` with these options; [] if it is dropped."""
+    """Return the frame after FFmpeg's filter `sidedata` with these options.
+
+    [] if it is dropped, or of a format that filters refuse.
+    """
     import av
 
-    graph = av.filter.Graph()
-    last = graph.add_buffer(
-        width=frame.width, height=frame.height, format=frame.format, time_base=frame.time_base
-    )
-    for step in steps:
-        following = graph.add("sidedata", step)
-        last.link_to(following)
-        last = following
-    last.link_to(graph.add("buffersink"))
-    graph.configure()
-    graph.push(frame)
-    try:
+    # FFmpegError includes the errors of an empty sink: BlockingIOError and EOFError.
+    with suppress(av.error.FFmpegError):
+        graph = av.filter.Graph()
+        last = graph.add_buffer(
+            width=frame.width, height=frame.height, format=frame.format, time_base=frame.time_base
+        )
+        for step in steps:
+            following = graph.add("sidedata", step)
+            last.link_to(following)
+            last = following
+        last.link_to(graph.add("buffersink"))
+        graph.configure()
+        graph.push(frame)
         return [graph.vpull()]
-    except (BlockingIOError, EOFError):
-        return []
+    return []
 
 
 def _rank(frame: Any) -> Any:

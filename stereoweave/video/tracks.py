@@ -94,13 +94,13 @@ class VideoTrack:
             first = next(_drop_corrupt(_decode(container, stream)), None)
             if first is None:
                 raise FormatError(f"{path}: expected a video, found a file without a decodable frame")
-            self._describe(first)
+            self._describe(first, stream.codec_context.name)
 
-    def _describe(self, first: "av.VideoFrame") -> None:
+    def _describe(self, first: "av.VideoFrame", codec: str) -> None:
         """Set what the first frame says about all frames."""
         self._frame_size_px = first.width, first.height
         self.size_px = self._frame_size_px if first.rotation % 180 == 0 else self._frame_size_px[::-1]
-        self.is_spatial = is_spatial(first)
+        self.is_spatial = codec == "hevc" and is_spatial(first)
         declared = read_stereo3d(first) or Stereo3D()
         self._right_first = declared.is_right_first
         self.declared_packing = None if self.is_spatial else _name_packing(declared)
@@ -293,7 +293,7 @@ def is_spatial_file(path: Path) -> bool:
     """Return whether a file is a spatial video (MV-HEVC); False for a file that cannot be decoded."""
     with suppress(StereoweaveError), _opening(path) as (container, stream):
         first = next(_drop_corrupt(_decode(container, stream)), None)
-        return first is not None and is_spatial(first)
+        return first is not None and stream.codec_context.name == "hevc" and is_spatial(first)
     return False
 
 

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 from other_processes import halted
+from rich.console import Console
 from spatial_examples import SPATIAL, spatial_pairs
 from video_examples import TEXTURED, damage, example_pairs, packets, write_side_by_side, write_video
 
@@ -23,10 +24,13 @@ from stereoweave.errors import StereoweaveError
 from stereoweave.io.colormap import colour_disparity
 from stereoweave.io.images import read_image, write_image
 from stereoweave.learn.data.collage import paint_collage
+from stereoweave.matching.backend import Backend
 from stereoweave.matching.matcher import Matcher
 from stereoweave.rendering.layouts import LAYOUTS, LayoutOptions, squeeze
 from stereoweave.rendering.renderer import Renderer
-from stereoweave.stereo import StereoPair
+from stereoweave.stereo import StereoCamera, StereoPair
+from stereoweave.video.convert import convert_video
+from stereoweave.video.job import VideoJob
 from stereoweave.video.reader import StereoFrame, StereoVideo, open_video
 
 # A part lasts 4 s, so it has 5 of these frames.
@@ -505,6 +509,27 @@ def test_shots_out_of_line_are_rectified_and_swapped_videos_swapped_back(tmp_pat
     for index in (0, 5):
         off_px = (found[index].astype(float) - expected[index])[20:-20, 20:-20] / 256
         assert np.median(np.abs(off_px - np.median(off_px))) < 0.5
+
+
+@pytest.mark.parametrize(("kind", "value"), [("depth16", " = value / 256"), ("depth", " px is red")])
+def test_a_rectified_shot_leaves_the_whole_video_without_metres(tmp_path, kind, value):
+    """The right views of the first shot are 5 px lower; the second shot is sound."""
+    lowered, sound = (paint_collage(77, 0, index, 240, 320) for index in (2, 6))
+    pairs = [(cut(lowered.left), cut(np.roll(lowered.right, 5, axis=0)))] * 3
+    pairs += [(cut(sound.left), cut(sound.right))] * 3
+    source = write_side_by_side(tmp_path / "in.mkv", pairs, codec="libx264")
+    comments = []
+    for rectify in (True, False):
+        video = open_video([source], "side_by_side")
+        video.camera = StereoCamera(focal_px=300, baseline_m=0.1, cx_px=159.5, cy_px=95.5)
+        job = VideoJob(**{kind: True}, rectify=rectify, backend=Backend(threads=1))
+        out = tmp_path / f"{rectify}.mkv"
+        convert_video(video, [source], out, job, Console(quiet=True))
+        with av.open(str(out)) as container:
+            comments.append(container.metadata["COMMENT"])
+    assert comments[0].endswith(f"{value}; no depth in metres, because frames were rectified")
+    assert " m)" not in comments[0]
+    assert "depth in metres = 7680 / value" in comments[1] or "m) is red" in comments[1]  # 300 * 0.1 * 256
 
 
 def cut(image):

@@ -62,6 +62,18 @@ def test_a_swapped_video_is_swapped_back():
     np.testing.assert_array_equal(found.left, pair.left)
 
 
+def test_an_aligner_remembers_that_it_has_warped_a_shot_before(shots):
+    sound = painted(2).pair
+    aligner = ShotAligner()
+    aligner(sound)
+    assert not ShotAligner.from_state(aligner.state()).has_warped
+    aligner.begin_shot()
+    aligner(shots[0])
+    aligner.begin_shot()
+    assert aligner(sound) is sound
+    assert ShotAligner.from_state(aligner.state()).has_warped
+
+
 @pytest.mark.parametrize("sway_px", [0, 4])
 def test_a_restored_aligner_continues_the_shot(shots, sway_px):
     frame = shots[0]

@@ -1,10 +1,12 @@
 import os
 from fractions import Fraction
 from math import sqrt
+from types import SimpleNamespace
 
 import av
 import numpy as np
 import pytest
+from av.sidedata.sidedata import Type
 from spatial_examples import (
     SPATIAL,
     SPATIAL_FRAMES,
@@ -19,6 +21,7 @@ from video_examples import example_pairs, packets, write_video
 
 from stereoweave.errors import StereoweaveError
 from stereoweave.video.reader import open_video
+from stereoweave.video.spatial import is_spatial, read_stereo3d
 from stereoweave.video.tracks import open_track
 
 BEFORE = "damaged: replaced by the frame before it"
@@ -247,6 +250,32 @@ def test_reading_closes_the_file(tmp_path):
     before = count_open()
     list(open_video([SPATIAL]).frames())
     assert count_open() == before
+
+
+class UnnamedFrame:
+    """Frame with a kind of side data that PyAV cannot name."""
+
+    @property
+    def side_data(self):
+        raise ValueError("34 is not a valid Type")
+
+
+def test_side_data_that_nothing_can_name_says_nothing(monkeypatch):
+    monkeypatch.setattr("stereoweave.video.spatial._filtered", lambda frame, *steps: [frame])
+    assert read_stereo3d(UnnamedFrame()) is None
+
+
+def test_declared_stereo_of_another_length_is_read_as_far_as_it_is_known():
+    numbers = np.array([8, 1, 0, 0, 63_500, 15, 1000, 60, 1, 7], np.int32).tobytes()
+    said = read_stereo3d(SimpleNamespace(side_data={Type.STEREO3D: numbers}))
+    assert (said.is_inverted, said.baseline_m, said.field_of_view_deg) == (True, 0.0635, 60)
+    assert read_stereo3d(SimpleNamespace(side_data={Type.STEREO3D: numbers[:20]})) is None
+
+
+def test_a_frame_that_filters_refuse_is_not_spatial():
+    frame = av.VideoFrame(0, 0, "yuv420p")
+    frame.time_base = Fraction(1, 25)
+    assert not is_spatial(frame)
 
 
 @pytest.mark.testdata
