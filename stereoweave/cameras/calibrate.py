@@ -215,7 +215,7 @@ def _check_board(pairs: Sequence[tuple[Path, Path]], board: Board) -> None:
             setting="board",
         )
     # A board that is too small for a glance is found at full size.
-    if empty == looked and (image is None or not shows_chessboard(image, board)):
+    if image is not None and empty == looked and not shows_chessboard(image, board):
         raise StereoweaveError(
             f"expected {board}, found none in {looked} of {2 * len(pairs)} pictures, spread over the folder; "
             "take sharp pictures with the whole board in both views, and name the marker dictionary of a "
