@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 from PIL import Image
 
-from stereoweave.errors import FormatError, Remedy, StereoweaveError, require_extra
+from stereoweave.errors import FormatError, StereoweaveError, require_extra
 from stereoweave.io import exif
 
 BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"})
@@ -52,7 +52,7 @@ def open_heif(path: Path) -> Image.Image:
 
     Raises:
         FormatError: pillow-heif is not installed, the file is larger than 500 MB, or its box `meta` is
-            missing, larger than 1 MB, or lists more than 20 pictures beside hidden ones.
+            larger than 1 MB, or lists more than 20 pictures beside hidden ones.
         Exception: The file is damaged; pillow-heif raises SyntaxError, ValueError and others.
     """
     try:
@@ -71,17 +71,21 @@ def open_heif(path: Path) -> Image.Image:
 
 
 def read_sizes(path: Path) -> list[tuple[int, int]]:
-    """Return the widths and heights in pixels of all pictures and tiles, as the file states them."""
+    """Return the widths and heights in pixels of all pictures and tiles, as the file states them.
+
+    Those of cropped pictures are among them, because a damaged crop may be larger than its picture.
+    """
     parts = _split_boxes(_read_meta(path)[4:])
-    shared = (
-        _split_boxes(part) for kind, content in parts if kind == b"iprp" for _, part in _split_boxes(content)
-    )
-    return [
-        struct.unpack_from(">LL", content, 4)
-        for properties in shared
-        for kind, content in properties
-        if kind == b"ispe" and len(content) >= 12
-    ]
+    inner = (_split_boxes(content) for kind, content in parts if kind == b"iprp")
+    sizes_px = []
+    for kind, content in (box for boxes in inner for _, part in boxes for box in _split_boxes(part)):
+        if kind == b"ispe" and len(content) >= 12:
+            sizes_px.append(struct.unpack_from(">LL", content, 4))
+        elif kind == b"clap" and len(content) >= 16:
+            # Each is a fraction.
+            width, parts_w, height, parts_h = struct.unpack_from(">4L", content)
+            sizes_px.append((width // max(parts_w, 1), height // max(parts_h, 1)))
+    return sizes_px
 
 
 def find_views(picture: Any) -> list[int]:
@@ -128,12 +132,9 @@ def read_lens(path: Path, picture: Any) -> exif.Lens | None:
 
 
 def _check_meta(path: Path, meta: bytes) -> None:
-    """Raise a FormatError if the contents of the box `meta` are missing, or list too many pictures."""
+    """Raise a ValueError if the contents of the box `meta` are missing, a FormatError for many pictures."""
     if not meta:
-        raise FormatError(
-            f"{path}: expected a HEIC picture with one box 'meta', found none or several",
-            remedy=Remedy("copy it again"),
-        )
+        raise ValueError("no box 'meta', or several")
     # All entries, wherever they are: a search by boxes would miss those that only libheif finds.
     entries = [meta[found.end() : found.end() + 14] for found in re.finditer(b"infe", meta)]
     count = sum(_is_visible_picture(entry) for entry in entries)

@@ -53,7 +53,7 @@ MISTAKES = {
     "depth film.mp4": "film.mp4: expected a picture (PNG, JPEG, TIFF or the like), found a video; convert it "
     "as such (stereoweave video)",
     "depth photo.heic photo.heic": "photo.heic: expected a picture (PNG, JPEG, TIFF or the like), found "
-    "one that cannot be read (Invalid input: Unspecified: No meta box found); copy it again",
+    "one that cannot be read (no box 'meta', or several); copy it again",
     "depth small.png right.png": "expected left and right pictures of the same size, found small.png with "
     "300x200 and right.png with 640x480 pixels; crop or rescale one of them",
     "depth --list pairs.txt": "pairs.txt: expected a list of pairs, found no such file",

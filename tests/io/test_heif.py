@@ -371,9 +371,7 @@ def test_a_second_box_of_pictures_is_refused(tmp_path, pair, first):
     end = start + int.from_bytes(content[start : start + 4])
     at = start if first else len(content)
     path.write_bytes(content[:at] + content[start:end] + content[at:])
-    assert "expected a HEIC picture with one box 'meta', found none or several" in refusal_of(
-        read_image, path
-    )
+    assert "found one that cannot be read (no box 'meta', or several)" in refusal_of(read_image, path)
 
 
 def test_endless_boxes_are_not_followed(tmp_path):
@@ -390,6 +388,14 @@ def test_a_view_of_enormous_size_is_refused_before_memory_is_allocated(tmp_path,
     changed(path, path, (stated, enormous))
     refusal = refusal_of(lambda path: open_pictures([path]), path)
     assert "expected at most 130 megapixels, found 12000x11000; scale it down" in refusal
+
+
+def test_a_crop_larger_than_its_picture_is_refused(tmp_path):
+    # Widths and heights are fractions: 24,000 / 2 and 11,000 / 1.
+    crop = box(b"clap", struct.pack(">8L", 24_000, 2, 11_000, 1, 0, 1, 0, 1))
+    path = tmp_path / "a.heic"
+    path.write_bytes(of_boxes(box(b"ispe", bytes(4), struct.pack(">LL", 64, 48)), crop))
+    assert heif.read_sizes(path) == [(64, 48), (12_000, 11_000)]
 
 
 # Damaged files
