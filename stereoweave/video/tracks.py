@@ -131,11 +131,14 @@ class VideoTrack:
     ) -> Iterator[Shot]:
         """Seek to the last key frame at or before a frame, and return the shots from a key frame on.
 
-        Containers without an index may seek to a later one.
+        Containers without an index may seek to a later one. There are none if timestamps are missing: a frame
+        without one is numbered by the frames before it.
         """
         import av
 
         assert self._stamps is not None
+        if self._lacks_stamps:
+            return iter(())
         try:
             container.seek(self._stamps[first], stream=stream)
         except av.error.FFmpegError:
@@ -188,6 +191,7 @@ class VideoTrack:
         self.steps: Sequence[int] = range(len(stamps))
         self.time_base = 1 / rate
         self._stamps: Sequence[int] | None = None
+        self._lacks_stamps = None in stamps
         # Raw streams and some AVI files have no timestamps. Their frames are timed by order and frame rate.
         if 2 * len(set(stamps) - {None}) > len(stamps):
             self.time_base = Fraction(stream.time_base or 1)
