@@ -75,7 +75,7 @@ class VideoTrack:
         declared_packing: Frame packing declared in the file, either a full-size packing in `PAIR_LAYOUTS` or
             an unsupported packing; None if the file declares no packing, or is a spatial video.
         is_spatial: Whether the video is a spatial one (MV-HEVC), with each view in a layer of its own.
-        camera: Camera of the views of a spatial video, if the file declares it.
+        camera: Camera of the views of a spatial video, if the file declares it and rotates no views.
         notes: Notes on views and colours.
         sound: Path of the file if it has sound, else None.
         truncation: Message about a file that ends early; None for a complete file.
@@ -104,7 +104,9 @@ class VideoTrack:
         declared = read_stereo3d(first) or Stereo3D()
         self._right_first = declared.is_right_first
         self.declared_packing = None if self.is_spatial else _name_packing(declared)
-        self.camera = declared.camera(self._frame_size_px) if self.is_spatial else None
+        # The file does not say whether field of view and baseline are meant before or after a rotation.
+        has_camera = self.is_spatial and first.rotation % 360 == 0
+        self.camera = declared.camera(self._frame_size_px) if has_camera else None
         self.notes = [declared.note()] if self.is_spatial else []
         if hdr := name_hdr(first):
             self.notes.append(Note(f"the video is HDR ({hdr}); it is tone-mapped to SDR (BT.709)"))

@@ -1,4 +1,5 @@
 import os
+import struct
 from fractions import Fraction
 from math import sqrt
 from types import SimpleNamespace
@@ -117,6 +118,17 @@ def test_without_a_known_perspective_there_is_no_camera(tmp_path, boxes, said):
     assert video.camera is None
     assert len(list(video.frames())) == SPATIAL_FRAMES
     assert [str(note) for note in video.notes] == [f"spatial video (MV-HEVC), left view first{said}"]
+
+
+def test_a_turned_spatial_video_has_no_camera(tmp_path):
+    content = bytearray(SPATIAL.read_bytes())
+    # The matrix of the first track header: 1 0 0 0 1 0 0 0 1 becomes 0 1 0 -1 0 0 0 0 1, a quarter turn.
+    start = content.index(b"tkhd") + 44
+    assert content[start : start + 4] == b"\0\1\0\0"
+    content[start : start + 20] = struct.pack(">5i", 0, 1 << 16, 0, -1 << 16, 0)
+    video = open_video([edited(tmp_path, bytes(content))])
+    assert video.size_px == (192, 320)
+    assert video.camera is None
 
 
 def assert_swapped(path):
