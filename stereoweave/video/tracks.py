@@ -128,6 +128,11 @@ class VideoTrack:
         with _opening(self._path) as (container, stream):
             yield from self._read_shots(container, stream)
 
+    def can_begin(self, most: int) -> bool:
+        """Return whether any of the first decoded images, at most this many, is a frame, with all its views."""
+        with _opening(self._path) as (container, stream):
+            return next(self._read_shots(container, stream, most), None) is not None
+
     def _read_after_seek(
         self, container: "av.container.InputContainer", stream: "av.VideoStream", first: int
     ) -> Iterator[Shot]:
@@ -149,9 +154,9 @@ class VideoTrack:
         return dropwhile(lambda shot: not shot.is_key_frame, self._read_shots(container, stream))
 
     def _read_shots(
-        self, container: "av.container.InputContainer", stream: "av.VideoStream"
+        self, container: "av.container.InputContainer", stream: "av.VideoStream", most: int | None = None
     ) -> Iterator[Shot]:
-        decoded: Iterator[Any] = _decode(container, stream)
+        decoded: Iterator[Any] = islice(_decode(container, stream), most)
         moments = pair_views(decoded) if self.is_spatial else decoded
         placed = (
             _number_by_rank(moments, stream)
