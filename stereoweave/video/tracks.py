@@ -129,7 +129,7 @@ class VideoTrack:
             yield from self._read_shots(container, stream)
 
     def can_begin(self, most: int) -> bool:
-        """Return whether any of the first decoded images, at most this many, is a frame, with all its views."""
+        """Return whether the first decoded images, at most this many, hold a frame with all its views."""
         with _opening(self._path) as (container, stream):
             return next(self._read_shots(container, stream, most), None) is not None
 
