@@ -91,7 +91,7 @@ def convert_video(
             for note in [*notes, *job.find_losses(survey)]:
                 _print_line(console, note.format(job.name_of))
         frames = video.frames(converter.tally.frames)
-        opening = list(islice(frames, 1))  # decodes from a key frame on, which is no part of the speed
+        opening = list(islice(frames, 1))  # may decode frames before it, which is no part of the speed
         meter = _Meter(bar, out.name, video, converter.tally.frames)
         for first in chain(opening, frames):
             part = islice(chain([first], frames), round(PART_S * video.rate) or 1)

@@ -12,7 +12,10 @@ from jaxtyping import UInt8
 
 from stereoweave.errors import FormatError, Remedy, StereoweaveError
 from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS, detect_layout
-from stereoweave.video.tracks import Shot, Track, open_track
+from stereoweave.video.tracks import Shot, Track, VideoTrack, open_track
+
+# A spatial video is refused if none of this many images is followed by its second view.
+_MOST_ALONE = 300
 
 _REPEATED_LAST, _REPEATED_NEXT = (
     "damaged: replaced by the frame before it",
@@ -172,7 +175,7 @@ def open_video(
         _check_alike(*tracks)
         return StereoVideo(tracks, None)
     [track] = tracks
-    if track.is_spatial:
+    if isinstance(track, VideoTrack) and track.is_spatial:
         check_unpacked(track.name, format)
         _check_second_view(track)
         return StereoVideo(tracks, None)
@@ -193,11 +196,11 @@ def check_unpacked(name: str, format: str | None) -> None:
         )
 
 
-def _check_second_view(track: Track) -> None:
-    if next(iter(track.shots(0)), None) is None:
+def _check_second_view(track: VideoTrack) -> None:
+    if not track.can_begin(_MOST_ALONE):
         raise FormatError(
             f"{track.name}: expected both views of a spatial video (MV-HEVC), found no frame with a second "
-            "view; export the video again"
+            f"view among the first {_MOST_ALONE}; export the video again"
         )
 
 

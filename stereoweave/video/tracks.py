@@ -75,7 +75,7 @@ class VideoTrack:
         declared_packing: Frame packing declared in the file, either a full-size packing in `PAIR_LAYOUTS` or
             an unsupported packing; None if the file declares no packing, or is a spatial video.
         is_spatial: Whether the video is a spatial one (MV-HEVC), with each view in a layer of its own.
-        camera: Camera of the views of a spatial video, if the file declares it.
+        camera: Camera of the views of a spatial video, if the file declares it and rotates no views.
         notes: Notes on views and colours.
         sound: Path of the file if it has sound, else None.
         truncation: Message about a file that ends early; None for a complete file.
@@ -104,7 +104,9 @@ class VideoTrack:
         declared = read_stereo3d(first) or Stereo3D()
         self._right_first = declared.is_right_first
         self.declared_packing = None if self.is_spatial else _name_packing(declared)
-        self.camera = declared.camera(self._frame_size_px) if self.is_spatial else None
+        # The file does not say whether field of view and baseline are meant before or after a rotation.
+        has_camera = self.is_spatial and first.rotation % 360 == 0
+        self.camera = declared.camera(self._frame_size_px) if has_camera else None
         self.notes = [declared.note()] if self.is_spatial else []
         if hdr := name_hdr(first):
             self.notes.append(Note(f"the video is HDR ({hdr}); it is tone-mapped to SDR (BT.709)"))
@@ -126,16 +128,24 @@ class VideoTrack:
         with _opening(self._path) as (container, stream):
             yield from self._read_shots(container, stream)
 
+    def can_begin(self, most: int) -> bool:
+        """Return whether the first decoded images, at most this many, hold a frame with all its views."""
+        with _opening(self._path) as (container, stream):
+            return next(self._read_shots(container, stream, most), None) is not None
+
     def _read_after_seek(
         self, container: "av.container.InputContainer", stream: "av.VideoStream", first: int
     ) -> Iterator[Shot]:
         """Seek to the last key frame at or before a frame, and return the shots from a key frame on.
 
-        Containers without an index may seek to a later one.
+        Containers without an index may seek to a later one. There are none if timestamps are missing: a frame
+        without one is numbered by the frames before it.
         """
         import av
 
         assert self._stamps is not None
+        if self._lacks_stamps:
+            return iter(())
         try:
             container.seek(self._stamps[first], stream=stream)
         except av.error.FFmpegError:
@@ -144,9 +154,9 @@ class VideoTrack:
         return dropwhile(lambda shot: not shot.is_key_frame, self._read_shots(container, stream))
 
     def _read_shots(
-        self, container: "av.container.InputContainer", stream: "av.VideoStream"
+        self, container: "av.container.InputContainer", stream: "av.VideoStream", most: int | None = None
     ) -> Iterator[Shot]:
-        decoded: Iterator[Any] = _decode(container, stream)
+        decoded: Iterator[Any] = islice(_decode(container, stream), most)
         moments = pair_views(decoded) if self.is_spatial else decoded
         placed = (
             _number_by_rank(moments, stream)
@@ -188,6 +198,7 @@ class VideoTrack:
         self.steps: Sequence[int] = range(len(stamps))
         self.time_base = 1 / rate
         self._stamps: Sequence[int] | None = None
+        self._lacks_stamps = None in stamps
         # Raw streams and some AVI files have no timestamps. Their frames are timed by order and frame rate.
         if 2 * len(set(stamps) - {None}) > len(stamps):
             self.time_base = Fraction(stream.time_base or 1)

@@ -22,6 +22,7 @@ from video_examples import (
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.images import write_image
 from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS, detect_layout, measure_resemblance
+from stereoweave.video import tracks
 from stereoweave.video.reader import open_video
 from stereoweave.video.tracks import _fill_missing, _number_by_rank, _separate_duplicates, open_track
 
@@ -514,6 +515,31 @@ def test_decoding_for_an_excerpt_begins_at_the_key_frame_before_it(tmp_path):
     path = write_side_by_side(tmp_path / "video.mkv", example_pairs(30), codec="libx264", options={"g": "8"})
     track = open_track(path, None)
     assert [next(track.shots(0, first)).number for first in (0, 7, 8, 20, 29)] == [0, 0, 8, 16, 24]
+
+
+def test_an_excerpt_after_a_key_frame_without_a_time_stamp_has_the_frames_of_the_whole_video(
+    tmp_path, monkeypatch
+):
+    path = write_side_by_side(tmp_path / "video.mkv", example_pairs(12), codec="mpeg4", options={"g": "4"})
+    decode, stamps_of = tracks._decode, tracks._stamps
+    missing = 8 * FRAME_MS
+
+    def decode_without_stamp(*file):
+        for frame in decode(*file):
+            frame.pts = None if frame.pts == missing else frame.pts
+            yield frame
+
+    def stamps_without_one(*file):
+        stamps, *rest = stamps_of(*file)
+        return [None if stamp == missing else stamp for stamp in stamps], *rest
+
+    monkeypatch.setattr(tracks, "_decode", decode_without_stamp)
+    monkeypatch.setattr(tracks, "_stamps", stamps_without_one)
+    video = open_video([path], "side_by_side")
+    whole = list(video.frames())
+    part = list(video.excerpt(0.36, 0.12).frames())  # frames 9 to 11 of 25 a second
+    assert_same(part, [frame._replace(time=frame.time - whole[9].time) for frame in whole[9:]])
+    assert [frame.problem for frame in part] == [None, None, None]
 
 
 def test_an_excerpt_ends_with_its_video(tmp_path):

@@ -1,4 +1,5 @@
 import os
+import struct
 from fractions import Fraction
 from math import sqrt
 from types import SimpleNamespace
@@ -20,6 +21,7 @@ from spatial_examples import (
 from video_examples import example_pairs, packets, write_video
 
 from stereoweave.errors import StereoweaveError
+from stereoweave.video import tracks
 from stereoweave.video.reader import open_video
 from stereoweave.video.spatial import is_spatial, read_stereo3d
 from stereoweave.video.tracks import open_track
@@ -119,6 +121,17 @@ def test_without_a_known_perspective_there_is_no_camera(tmp_path, boxes, said):
     assert [str(note) for note in video.notes] == [f"spatial video (MV-HEVC), left view first{said}"]
 
 
+def test_a_turned_spatial_video_has_no_camera(tmp_path):
+    content = bytearray(SPATIAL.read_bytes())
+    # The matrix of the first track header: 1 0 0 0 1 0 0 0 1 becomes 0 1 0 -1 0 0 0 0 1, a quarter turn.
+    start = content.index(b"tkhd") + 44
+    assert content[start : start + 4] == b"\0\1\0\0"
+    content[start : start + 20] = struct.pack(">5i", 0, 1 << 16, 0, -1 << 16, 0)
+    video = open_video([edited(tmp_path, bytes(content))])
+    assert video.size_px == (192, 320)
+    assert video.camera is None
+
+
 def assert_swapped(path):
     video = open_video([path])
     assert "right view first" in str(video.notes[0])
@@ -176,6 +189,27 @@ def test_a_second_view_that_is_missing_in_a_part_is_a_problem_of_that_part(tmp_p
 def test_a_spatial_video_without_its_second_view_is_refused(tmp_path):
     said = refusal(edited(tmp_path, without(1, range(SPATIAL_FRAMES))))
     assert "found no frame with a second view" in said
+
+
+def test_a_long_spatial_video_without_its_second_view_is_refused_without_decoding_all_of_it(
+    tmp_path, monkeypatch
+):
+    alone = edited(tmp_path, without(1, range(SPATIAL_FRAMES)))
+    stream = b"".join(
+        b"\0\0\0\1" + body[start:end] for _, body in packets(alone, "video") for start, end, *_ in units(body)
+    )
+    path = tmp_path / "long.hevc"
+    path.write_bytes(8 * stream)
+    decode, decoded = tracks._decode, []
+
+    def count_decoded(*file):
+        for frame in decode(*file):
+            decoded.append(frame.pts)
+            yield frame
+
+    monkeypatch.setattr(tracks, "_decode", count_decoded)
+    assert "found no frame with a second view" in refusal(path)
+    assert len(decoded) < 8 * SPATIAL_FRAMES
 
 
 def test_damaged_boxes_about_the_cameras_are_reported(tmp_path):
