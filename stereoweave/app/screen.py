@@ -24,7 +24,6 @@ _BOUNDARY = "frame"
 _PAGE = b"""<!doctype html>
 <html lang="en">
 <meta charset="utf-8">
-<link rel="icon" href="data:,">
 <title>Stereoweave live</title>
 <style>
   body { margin: 0; background: #111 }
