@@ -13,7 +13,16 @@ from experiments.paper.trials import CLAIMS
 REPOSITORY = Path(__file__).resolve().parents[2]
 RECIPE = REPOSITORY / "recipes" / "weave_small.toml"
 PAPER_RECIPE = REPOSITORY / "recipes" / "paper" / "experiment.toml"
-EXPERIMENTS = "ablations", "first_run", "handheld", "paper", "speed", "stage_costs", "video_speed"
+EXPERIMENTS = (
+    "ablations",
+    "first_run",
+    "handheld",
+    "paper",
+    "speed",
+    "stage_costs",
+    "video_speed",
+    "whole_films",
+)
 README = (REPOSITORY / "experiments" / "README.md").read_text(encoding="utf-8")
 
 
@@ -52,6 +61,11 @@ def folder(tmp_path, monkeypatch):
         (f"paper {RECIPE} -o runs --report report --exponent-only --jobs 0", ["--jobs"]),
         ("ablations none.toml -o runs --report rows.csv", ["none.toml", "expected a recipe"]),
         ("stage_costs none.pt -o rows.csv", ["none.pt", "no such checkpoint"]),
+        ("whole_films none.mp4 -o rows.csv", ["none.mp4", "no such"]),
+        (
+            "whole_films none.mp4 -o rows.csv --output hologram",
+            ["side_by_side, anaglyph", "found 'hologram'"],
+        ),
     ],
 )
 def test_a_mistake_with_an_experiment_is_reported_in_one_line(folder, capfd, line, fragments):
