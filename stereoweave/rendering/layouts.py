@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
@@ -88,12 +89,18 @@ class LayoutOptions:
             )
 
 
+Eye: TypeAlias = UInt8[np.ndarray, "_ _ 3"]
+"""View of one eye, or both joined in one image; uint8 RGB."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Layout:
     """A way to compose one image from several views.
 
     Attributes:
         compose: Function that returns the image, uint8 RGB.
+        join: Function that returns the image from the views of the left and the right eye; None if the
+            layout shows more than these.
         positions: Outermost positions of the layout's views.
         converged: Whether views are overlaid or compared in place, so the middle of the scene should have no
             parallax.
@@ -103,6 +110,7 @@ class Layout:
     """
 
     compose: Callable[[Renderer, LayoutOptions], np.ndarray]
+    join: Callable[[Eye, Eye], Eye] | None = None
     positions: tuple[float, ...] = (0.0, 1.0)
     converged: bool = False
     mark: str = ""
@@ -135,53 +143,53 @@ def render_views(renderer: Renderer, positions: Iterable[float]) -> Iterator[UIn
     return (renderer.view(position).image for position in positions)
 
 
-def side_by_side(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
+def join_side_by_side(left: Eye, right: Eye) -> Eye:
     """Return both eyes' views side by side at full width, with the left eye's on the left."""
-    return np.hstack(_render_eyes(renderer))
+    return np.hstack([left, right])
 
 
-def side_by_side_half(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
+def join_side_by_side_half(left: Eye, right: Eye) -> Eye:
     """Return both eyes' views side by side, each at half width, with the left eye's on the left.
 
     If the width is odd, the last column is repeated.
     """
-    return np.hstack([squeeze(eye, axis=1) for eye in _render_eyes(renderer)])
+    return np.hstack([squeeze(eye, axis=1) for eye in (left, right)])
 
 
-def crossed(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
+def join_crossed(left: Eye, right: Eye) -> Eye:
     """Return both eyes' views side by side, with the right eye's on the left, for cross-eyed viewing."""
-    return np.hstack(_render_eyes(renderer)[::-1])
+    return np.hstack([right, left])
 
 
-def top_bottom(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
+def join_top_bottom(left: Eye, right: Eye) -> Eye:
     """Return both eyes' views one above the other at full height, with the left eye's on top."""
-    return np.vstack(_render_eyes(renderer))
+    return np.vstack([left, right])
 
 
-def top_bottom_half(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
+def join_top_bottom_half(left: Eye, right: Eye) -> Eye:
     """Return both eyes' views one above the other, each at half height, with the left eye's on top.
 
     If the height is odd, the last row is repeated.
     """
-    return np.vstack([squeeze(eye, axis=0) for eye in _render_eyes(renderer)])
+    return np.vstack([squeeze(eye, axis=0) for eye in (left, right)])
 
 
-def make_anaglyph(kind: str) -> Callable[[Renderer, LayoutOptions], np.ndarray]:
-    """Return the `compose` function of a red-cyan anaglyph, with red for the left eye.
+def make_anaglyph(kind: str) -> Callable[[Eye, Eye], Eye]:
+    """Return the `join` function of a red-cyan anaglyph, with red for the left eye.
 
     `kind` is a key of `_ANAGLYPHS`.
     """
     shares = [np.array(matrix, np.float32) for matrix in _ANAGLYPHS[kind]]
 
-    def compose(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
-        left, right = (
+    def join(left: Eye, right: Eye) -> Eye:
+        red, cyan = (
             cv2.transform(eye.astype(np.float32), matrix)
-            for eye, matrix in zip(_render_eyes(renderer), shares, strict=True)
+            for eye, matrix in zip((left, right), shares, strict=True)
         )
         # Round and clip only the sum, not each eye's part.
-        return cv2.add(left, right, dtype=cv2.CV_8U)
+        return cv2.add(red, cyan, dtype=cv2.CV_8U)
 
-    return compose
+    return join
 
 
 def rgbd(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
@@ -213,6 +221,15 @@ def contact_sheet(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarra
     return _join_tiles(_render_tiles(renderer, _SHEET_SIDE, _SHEET_SIDE, _SHEET_SIDE))
 
 
+def _join_eyes(join: Callable[[Eye, Eye], Eye], **rest: Any) -> Layout:
+    """Return a layout that shows the views of the left and the right eye and nothing else."""
+
+    def compose(renderer: Renderer, choices: LayoutOptions) -> Eye:
+        return join(*render_views(renderer, (0.0, 1.0)))
+
+    return Layout(compose=compose, join=join, **rest)
+
+
 def _swing_positions(count: int) -> tuple[float, ...]:
     """Return `count` positions from 0 to 1 and back along a cosine, which is slow at both ends."""
     return tuple((0.5 - 0.5 * np.cos(2 * np.pi * np.arange(count) / count)).tolist())
@@ -221,15 +238,12 @@ def _swing_positions(count: int) -> tuple[float, ...]:
 # VR players detect LR, TB and half in file names. The marks of full and crossed layouts follow iw3, the most
 # widely used conversion tool; the mark of a quilt follows Looking Glass.
 LAYOUTS: dict[str, Layout] = {
-    "side_by_side": Layout(compose=side_by_side, mark="_LRF_Full_SBS"),
-    "side_by_side_half": Layout(compose=side_by_side_half, mark="_half_LR", squeezed=("side_by_side", 1)),
-    "crossed": Layout(compose=crossed, mark="_RLF_cross"),
-    "top_bottom": Layout(compose=top_bottom, mark="_TBF_fulltb"),
-    "top_bottom_half": Layout(compose=top_bottom_half, mark="_half_TB", squeezed=("top_bottom", 0)),
-    "anaglyph_grey": Layout(compose=make_anaglyph("grey"), converged=True),
-    "anaglyph_colour": Layout(compose=make_anaglyph("colour"), converged=True),
-    "anaglyph_half_colour": Layout(compose=make_anaglyph("half_colour"), converged=True),
-    "anaglyph_dubois": Layout(compose=make_anaglyph("dubois"), converged=True),
+    "side_by_side": _join_eyes(join_side_by_side, mark="_LRF_Full_SBS"),
+    "side_by_side_half": _join_eyes(join_side_by_side_half, mark="_half_LR", squeezed=("side_by_side", 1)),
+    "crossed": _join_eyes(join_crossed, mark="_RLF_cross"),
+    "top_bottom": _join_eyes(join_top_bottom, mark="_TBF_fulltb"),
+    "top_bottom_half": _join_eyes(join_top_bottom_half, mark="_half_TB", squeezed=("top_bottom", 0)),
+    **{f"anaglyph_{kind}": _join_eyes(make_anaglyph(kind), converged=True) for kind in _ANAGLYPHS},
     "rgbd": Layout(compose=rgbd, positions=(), mark="_RGBD"),
     "quilt": Layout(compose=quilt, positions=_FAN, converged=True, mark="_qs{columns}x{rows}a{aspect:g}"),
     "contact_sheet": Layout(compose=contact_sheet, positions=_FAN, converged=True),
@@ -332,11 +346,6 @@ def write_picture(path: str | Path, picture: UInt8[np.ndarray, "h w 3"]) -> None
         else:
             left, right = (Image.fromarray(half) for half in np.split(picture, 2, axis=1))
             left.save(temporary, "MPO", save_all=True, append_images=[right], **_FINE)
-
-
-def _render_eyes(renderer: Renderer) -> list[UInt8[np.ndarray, "h w 3"]]:
-    """Render the views of the left and the right eye."""
-    return list(render_views(renderer, (0.0, 1.0)))
 
 
 def squeeze(eye: UInt8[np.ndarray, "h w 3"], axis: int) -> UInt8[np.ndarray, "h2 w2 3"]:

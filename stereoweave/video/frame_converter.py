@@ -1,8 +1,9 @@
 """Conversion of frames to output images, whose steps overlap in threads."""
 
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
+from itertools import chain
 from typing import TypeVar
 
 import numpy as np
@@ -10,6 +11,7 @@ import numpy as np
 from stereoweave.matching.estimate import match
 from stereoweave.matching.matcher import Matcher
 from stereoweave.matching.options import MatchOptions
+from stereoweave.rendering.layouts import Eye
 from stereoweave.stereo import Estimate
 from stereoweave.system.ahead import ahead
 from stereoweave.system.threads import thread_count
@@ -119,10 +121,23 @@ class FrameConverter:
         All frames are consumed before the iterator ends, so that `state` is complete.
         """
         groups = self._overlap(map(self._squeezed.squeeze, self._grouper(frames)), _GROUPS_AHEAD)
+        join = self._squeezed.job.join
+        converted = self._convert_depth(groups) if join is None else self._join_views(groups, join)
+        yield from self._overlap(converted, _PICTURES_AHEAD)
+        self.tally.cuts = self._grouper.cuts
+
+    def _convert_depth(self, groups: Iterator[FrameGroup]) -> Iterator[tuple[Fraction, Picture]]:
         matched = self._overlap(map(self._match, groups), _GROUPS_AHEAD)
         estimated = self._overlap(carry_depth(matched, self._filter, self._threads), _ESTIMATES_AHEAD)
-        yield from self._overlap(map(self._render, estimated), _PICTURES_AHEAD)
-        self.tally.cuts = self._filter.cuts
+        return map(self._render, estimated)
+
+    def _join_views(
+        self, groups: Iterator[FrameGroup], join: Callable[[Eye, Eye], Eye]
+    ) -> Iterator[tuple[Fraction, Picture]]:
+        """Yield output images that show the pictures of both cameras as they are, which needs no matching."""
+        for frame, pair in chain.from_iterable(zip(*group, strict=True) for group in groups):
+            self.tally.add(frame)
+            yield frame.time, join(pair.left, pair.right)
 
     def _match(self, group: FrameGroup) -> tuple[FrameGroup, Estimate]:
         return group, match(self._matcher, group.pairs[-1], self._options)

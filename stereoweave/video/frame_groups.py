@@ -37,12 +37,16 @@ class FrameGrouper:
     Args:
         aligner: Aligner of the frames; None to leave them as they are.
         last_grey: Left image of the last frame, as read, grey and at half size; None at the start.
+
+    Attributes:
+        cuts: Number of shots that followed another one so far.
     """
 
     def __init__(
         self, aligner: ShotAligner | None, last_grey: UInt8[np.ndarray, "h w"] | None = None
     ) -> None:
         self._aligner, self._last_grey = aligner, last_grey
+        self.cuts = 0
 
     def __call__(self, frames: Iterable[StereoFrame]) -> Iterator[FrameGroup]:
         """Yield the frames in groups. The last frame ends a group, so that it is matched in any case."""
@@ -64,18 +68,23 @@ class FrameGrouper:
     def state(self) -> dict[str, np.ndarray]:
         """Return the complete state as arrays; a restored grouper gives the same results."""
         kept = {} if self._last_grey is None else {"last_grey": self._last_grey}
-        return kept | (self._aligner.state() if self._aligner else {})
+        return {"shots_begun": np.array(self.cuts)} | kept | (self._aligner.state() if self._aligner else {})
 
     @classmethod
     def from_state(cls, state: Mapping[str, np.ndarray]) -> "FrameGrouper":
         """Restore a grouper from a saved `state`."""
-        return cls(ShotAligner.from_state(state) if "aligner" in state else None, state.get("last_grey"))
+        aligner = ShotAligner.from_state(state) if "aligner" in state else None
+        grouper = cls(aligner, state.get("last_grey"))
+        grouper.cuts = int(state["shots_begun"])
+        return grouper
 
     def _begin(self, frame: StereoFrame) -> StereoPair:
         """Return a frame's aligned pair; if the frame begins a shot, its rows are measured."""
         grey = _make_thumbnail(frame)
-        if self._aligner and self._last_grey is not None and self._begins_shot(grey):
-            self._aligner.begin_shot()
+        if self._last_grey is not None and self._begins_shot(grey):
+            self.cuts += 1
+            if self._aligner:
+                self._aligner.begin_shot()
         self._last_grey = grey
         return self._align(frame)
 

@@ -1,5 +1,6 @@
 """Settings of a video conversion, and the rendering of its output frames."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import isfinite
 
@@ -9,7 +10,7 @@ from jaxtyping import Float, UInt16
 from stereoweave.errors import NameOf, Note, Remedy, StereoweaveError, keyword
 from stereoweave.io.colormap import colour_disparity
 from stereoweave.matching.backend import Backend
-from stereoweave.rendering.layouts import LAYOUTS, LayoutOptions, check_positions
+from stereoweave.rendering.layouts import LAYOUTS, Eye, LayoutOptions, check_positions
 from stereoweave.rendering.renderer import Renderer
 from stereoweave.stereo import Estimate, StereoCamera, StereoPair
 from stereoweave.video.survey import Survey
@@ -88,6 +89,16 @@ class VideoJob:
         if self.layout:
             return LAYOUTS[self.layout].positions
         return () if self.position is None else (self.position,)
+
+    @property
+    def join(self) -> Callable[[Eye, Eye], Eye] | None:
+        """Function that makes the output from the pictures of both cameras; None if it shows their depth."""
+        if self.strength != 1 or self.convergence_px:
+            return None
+        if self.position in (0, 1):
+            return lambda left, right: right if self.position else left
+        layout = LAYOUTS.get(self.layout or "")
+        return layout.join if layout and not layout.converged else None
 
     def render_frame(self, pair: StereoPair, estimate: Estimate, survey: Survey) -> Picture:
         """Render the output image of one frame."""

@@ -17,7 +17,14 @@ import pytest
 from other_processes import halted
 from rich.console import Console
 from spatial_examples import SPATIAL, spatial_pairs
-from video_examples import TEXTURED, damage, example_pairs, packets, write_side_by_side, write_video
+from video_examples import (
+    TEXTURED,
+    damage,
+    example_pairs,
+    packets,
+    write_side_by_side,
+    write_video,
+)
 
 from stereoweave.cli.root import main
 from stereoweave.errors import StereoweaveError
@@ -180,6 +187,24 @@ def test_a_layout_equals_that_of_a_still_and_marks_the_file_name(tmp_path, name)
     made = tmp_path / f"out{LAYOUTS[name].mark}.mp4"
     assert np.abs(rgb_of(made)[0].astype(int) - still).mean() < 6
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(["in.mp4", made.name])
+
+
+@pytest.mark.parametrize(
+    "words",
+    [["--layout", "side_by_side"], ["--layout", "top_bottom_half"], ["--position", "1"]],
+    ids=lambda words: words[1],
+)
+def test_pictures_of_both_cameras_are_joined_without_matching(tmp_path, monkeypatch, capsys, words):
+    def refuse(*given):
+        raise StereoweaveError("matched")
+
+    monkeypatch.setattr("stereoweave.video.frame_converter.match", refuse)
+    upside_down = [(left[::-1], right[::-1]) for left, right in example_pairs(4)]
+    video = write_side_by_side(tmp_path / "in.mp4", [*example_pairs(5), *upside_down])
+    assert run(video, tmp_path / "out.mp4", "--no-rectify", *words) == 0
+    assert "9 frames, 1 cut" in capsys.readouterr().out
+    assert run(video, tmp_path / "stretched.mp4", "--no-rectify", *words, "--strength", "1.5") == 2
+    assert "matched" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("name", "axis"), [("side_by_side_half", 1), ("top_bottom_half", 0)])
