@@ -1,17 +1,19 @@
 """Benchmark of steadiness on noisy rendered videos: flicker and errors of three methods."""
 
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields, replace
 from fractions import Fraction
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from stereoweave.bench.flicker_metrics import flicker
+from stereoweave.bench.edge_metrics import NEAR_PX, near_edge
+from stereoweave.bench.flicker_metrics import find_thin, flicker, jumps_share
 from stereoweave.bench.flicker_videos import (
     LEFT,
     MIDDLE,
@@ -38,6 +40,7 @@ MEAN = "mean"
 FRAME_BY_FRAME, STEADY, CARRIED = "frame by frame", "steady", "carried"
 # Length of the whole camera path: five seconds.
 _PATH_FRAMES = 120
+_BAD_PX = 2.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,12 +51,17 @@ class FlickerRow:
         film: The video's name.
         noise_levels: Standard deviation of the image noise, in levels of 0..255.
         flicker_px: Flicker of the left view's disparity (flicker_metrics.py).
+        jumps_share: Share of the left view's points whose disparity jumps between two frames.
         view_flicker_levels: Flicker of the middle view, in levels of 0..255. The view is rendered from the
             noise-free images, so it flickers only if the disparity flickers.
         epe_px: End-point error of the left view.
         moving_epe_px: End-point error on the moving object; NaN if there is none.
+        outline_epe_px: End-point error within 3 px of the moving object's outline; NaN if there is none.
         uncovered_epe_px: End-point error at points that the previous frame did not show; NaN if there are
             none.
+        edge_epe_px: End-point error within 3 px of a depth edge (edge_metrics.py); NaN if there are none.
+        thin_epe_px: End-point error on thin things (`find_thin`); NaN if there are none.
+        bad2_percent: Percentage of the pixels that are off by more than 2 px.
         time_ms: Mean time per frame of the temporal filter, and of carrying depth; NaN if neither is used.
     """
 
@@ -66,11 +74,20 @@ class FlickerRow:
     frames: int
     noise_levels: float
     flicker_px: float
+    jumps_share: float
     view_flicker_levels: float
     epe_px: float
     moving_epe_px: float
+    outline_epe_px: float
     uncovered_epe_px: float
+    edge_epe_px: float
+    thin_epe_px: float
+    bad2_percent: float
     time_ms: float
+
+
+_COLUMNS = [field.name for field in fields(FlickerRow)]
+_SCORES = _COLUMNS[_COLUMNS.index("flicker_px") :]
 
 
 class _MethodOutput(NamedTuple):
@@ -145,8 +162,11 @@ def average_rows(rows: Sequence[FlickerRow]) -> list[FlickerRow]:
 
 
 def _average_group(name: str, rows: Sequence[FlickerRow]) -> FlickerRow:
-    numbers = ("flicker_px", "view_flicker_levels", "epe_px", "moving_epe_px", "uncovered_epe_px", "time_ms")
-    values: dict[str, Any] = {n: float(np.mean([getattr(row, n) for row in rows])) for n in numbers}
+    """Return the mean row over the scenes. Scenes without a score, such as on thin things, do not count."""
+    values: dict[str, Any] = {}
+    for column in _SCORES:
+        scores = np.array([getattr(row, column) for row in rows])
+        values[column] = _mean(scores, np.isfinite(scores))
     return replace(rows[0], film=name, scene=MEAN, **values)
 
 
@@ -207,25 +227,39 @@ def _measure_errors(video: RenderedVideo, result: _MethodOutput) -> dict[str, fl
     """Return the error columns of a row."""
     later = range(1, len(video.pairs))
 
-    def mean_flicker(shown: list[np.ndarray], position: float, with_change: bool) -> float:
+    def mean_over_frames(
+        measure: Callable[..., float], shown: list[np.ndarray], position: float, with_change: bool
+    ) -> float:
         per_frame = []
         for frame in later:
             motion_px, change_px = video.change(frame - 1, frame, position)
             visible = video.find_seen_again(frame - 1, frame, position)
             true_change = change_px if with_change else 0.0
-            per_frame.append(flicker(shown[frame - 1], shown[frame], motion_px, visible, true_change))
+            per_frame.append(measure(shown[frame - 1], shown[frame], motion_px, visible, true_change))
         return float(np.mean(per_frame))
 
-    errors_px = np.abs([result.disparities_px[frame] - video.disparities_px[frame][LEFT] for frame in later])
+    truths_px = np.array([video.disparities_px[frame][LEFT] for frame in later])
+    errors_px = np.abs(np.array(result.disparities_px[1:]) - truths_px)
     uncovered = ~np.array([video.find_seen_again(frame, frame - 1, LEFT) for frame in later])
     return {
-        "flicker_px": mean_flicker(result.disparities_px, LEFT, with_change=True),
-        "view_flicker_levels": mean_flicker(result.views, MIDDLE, with_change=False),
+        "flicker_px": mean_over_frames(flicker, result.disparities_px, LEFT, with_change=True),
+        "jumps_share": mean_over_frames(jumps_share, result.disparities_px, LEFT, with_change=True),
+        "view_flicker_levels": mean_over_frames(flicker, result.views, MIDDLE, with_change=False),
         "epe_px": float(errors_px.mean()),
         "moving_epe_px": _mean(errors_px, np.array(video.moving[1:])),
+        "outline_epe_px": _mean(errors_px, np.array([*map(_find_outline, video.moving[1:])])),
         "uncovered_epe_px": _mean(errors_px, uncovered),
+        "edge_epe_px": _mean(errors_px, np.array([*map(near_edge, truths_px)])),
+        "thin_epe_px": _mean(errors_px, np.array([*map(find_thin, truths_px)])),
+        "bad2_percent": 100 * float((errors_px > _BAD_PX).mean()),
     }
 
 
-def _mean(values: Float[np.ndarray, "n h w"], where: Bool[np.ndarray, "n h w"]) -> float:
+def _find_outline(moving: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Return the mask of the pixels within three pixels of a moving object's outline."""
+    window = np.ones((2 * NEAR_PX + 1, 2 * NEAR_PX + 1), np.uint8)
+    return cv2.morphologyEx(moving.astype(np.uint8), cv2.MORPH_GRADIENT, window) > 0
+
+
+def _mean(values: Float[np.ndarray, "*n"], where: Bool[np.ndarray, "*n"]) -> float:
     return float(values[where].mean()) if where.any() else float("nan")

@@ -1,4 +1,4 @@
-"""Flicker of a video: the difference between frames after compensation for the true motion."""
+"""Flicker and jumps of a video: the difference between frames after compensation for the true motion."""
 
 from itertools import product
 
@@ -10,6 +10,10 @@ from stereoweave.errors import StereoweaveError
 
 # Between frames, interpolation and slant change a point's true disparity by less than this.
 _SAME_SURFACE_PX = 1.0
+JUMP_PX = 2.0
+"""A point jumps if its disparity changes by this much more or less than its true disparity does."""
+_THIN_PX = 7
+_IN_FRONT_PX = 2.0
 
 
 def flicker(
@@ -37,25 +41,35 @@ def flicker(
     Raises:
         StereoweaveError: If the sizes differ, or a visible point leaves the image.
     """
-    shapes = [list(values.shape[:2]) for values in (before, after, motion_px, visible)]
-    if any(shape != shapes[0] for shape in shapes):
-        raise StereoweaveError(
-            f"flicker: expected two frames, their motion and a mask, all of the same size, found {shapes}"
-        )
-    columns, rows, inside = _find_targets(motion_px)
-    if (visible & ~inside).any():
-        raise StereoweaveError(
-            f"visible: expected points that stay in the image, found {(visible & ~inside).sum()} "
-            "that leave it; use find_seen_again"
-        )
-    found = cv2.remap(after.astype(np.float32), columns, rows, cv2.INTER_LINEAR)
-    # An image's channels come last and share one change.
-    error = np.abs(
-        found[visible].T.astype(np.float64)
-        - before[visible].T
-        - np.broadcast_to(change, visible.shape)[visible]
-    )
-    return float(error.mean()) if error.size else float("nan")
+    errors = _measure_change_errors(before, after, motion_px, visible, change)
+    return float(errors.mean()) if errors.size else float("nan")
+
+
+def jumps_share(
+    before_px: Float[np.ndarray, "h w"],
+    after_px: Float[np.ndarray, "h w"],
+    motion_px: Float[np.ndarray, "h w 2"],
+    visible: Bool[np.ndarray, "h w"],
+    change_px: Float[np.ndarray, "h w"] | float = 0.0,
+) -> float:
+    """Return the share of the points whose error of change (see `flicker`) exceeds `JUMP_PX`.
+
+    Flicker is small if many points tremble a little or if few jump far, but only jumps are seen. NaN if
+    there are no points. Arguments and errors are those of `flicker`.
+    """
+    errors_px = _measure_change_errors(before_px, after_px, motion_px, visible, change_px)
+    return float((errors_px > JUMP_PX).mean()) if errors_px.size else float("nan")
+
+
+def find_thin(truth_px: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Return the mask of the pixels of thin things.
+
+    These are pixels more than 2 px of disparity in front of what is left when everything is taken away into
+    which no square of 7x7 pixels fits.
+    """
+    window = np.ones((_THIN_PX, _THIN_PX), np.uint8)
+    thick_px = cv2.morphologyEx(truth_px.astype(np.float32), cv2.MORPH_OPEN, window)
+    return truth_px - thick_px > _IN_FRONT_PX
 
 
 def find_seen_again(
@@ -83,6 +97,34 @@ def find_seen_again(
         found_px = after_px[row.astype(np.intp), column.astype(np.intp)]
         seen &= np.abs(found_px - expected_px) <= _SAME_SURFACE_PX
     return seen
+
+
+def _measure_change_errors(
+    before: Shaped[np.ndarray, "h w *channels"],
+    after: Shaped[np.ndarray, "h w *channels"],
+    motion_px: Float[np.ndarray, "h w 2"],
+    visible: Bool[np.ndarray, "h w"],
+    change: Float[np.ndarray, "h w"] | float,
+) -> Float[np.ndarray, "*channels n"]:
+    """Return the absolute error of the change of each visible point; see `flicker`."""
+    shapes = [list(values.shape[:2]) for values in (before, after, motion_px, visible)]
+    if any(shape != shapes[0] for shape in shapes):
+        raise StereoweaveError(
+            f"flicker: expected two frames, their motion and a mask, all of the same size, found {shapes}"
+        )
+    columns, rows, inside = _find_targets(motion_px)
+    if (visible & ~inside).any():
+        raise StereoweaveError(
+            f"visible: expected points that stay in the image, found {(visible & ~inside).sum()} "
+            "that leave it; use find_seen_again"
+        )
+    found = cv2.remap(after.astype(np.float32), columns, rows, cv2.INTER_LINEAR)
+    # An image's channels come last and share one change.
+    return np.abs(
+        found[visible].T.astype(np.float64)
+        - before[visible].T
+        - np.broadcast_to(change, visible.shape)[visible]
+    )
 
 
 def _find_targets(

@@ -44,11 +44,18 @@ CLASS_HEADINGS = {"thin_or_edge": "edges", "weak_texture": "weak", "textured": "
 FLICKER_TABLES = {
     "Disparity and the middle view, mean over the scenes": {
         "flicker px": "flicker_px",
+        "jumps": "jumps_share",
         "of the view": "view_flicker_levels",
-        "EPE px": "epe_px",
-        "moving": "moving_epe_px",
-        "uncovered": "uncovered_epe_px",
+        "bad-2 %": "bad2_percent",
         "ms": "time_ms",
+    },
+    "End-point error of the disparity in px, mean over the scenes": {
+        "all": "epe_px",
+        "moving": "moving_epe_px",
+        "outline": "outline_epe_px",
+        "uncovered": "uncovered_epe_px",
+        "edges": "edge_epe_px",
+        "thin": "thin_epe_px",
     },
 }
 VIEWS_TABLES = {

@@ -11,13 +11,15 @@ from itertools import repeat
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32, Float64, Int32, UInt8
 
 from stereoweave.matching.left_right_check import find_occluded
 from stereoweave.stereo import Estimate, StereoPair
-from stereoweave.video.carried_kernels import Source, take_pixels
+from stereoweave.video.camera_motion import TrackedCorners, find_corners
+from stereoweave.video.carried_kernels import Source, locate, take_pixels
 from stereoweave.video.frame_groups import FrameGroup
-from stereoweave.video.motion import convert_to_grey, find_flow, halve
+from stereoweave.video.motion import convert_to_grey, halve, measure_motion
+from stereoweave.video.moved_points import find_camera_motion, move_points
 from stereoweave.video.reader import StereoFrame
 from stereoweave.video.temporal_filter import FilteredFrame, TemporalFilter
 from stereoweave.video.temporal_kernels import Track
@@ -67,8 +69,9 @@ def carry_between(
     if not pairs or before is None or after is None:
         return []
     shares = [number / (len(pairs) + 1) for number in range(1, len(pairs) + 1)]
+    matched = [(frame, find_corners(halve(frame.left_grey), frame.left.disparity_px)) for frame in (before, after)]
     with ThreadPoolExecutor(min(threads, len(pairs))) as pool:
-        return list(pool.map(_carry, pairs, repeat(before), repeat(after), shares))
+        return list(pool.map(_carry, pairs, repeat(matched), shares))
 
 
 def rehearse_carrying() -> None:
@@ -83,13 +86,15 @@ def rehearse_carrying() -> None:
     carry_between([pair], matched[0], matched[1], 1)
 
 
-def _carry(pair: StereoPair, before: FilteredFrame, after: FilteredFrame, share: float) -> Estimate:
+def _carry(pair: StereoPair, matched: list[tuple[FilteredFrame, TrackedCorners]], share: float) -> Estimate:
     """Return the estimate of the frame at this share of the time between two matched frames."""
     left, right = convert_to_grey(pair.left), convert_to_grey(pair.right)
-    of_left = (before.left_grey, before.left), (after.left_grey, after.left)
-    of_right = (before.right_grey, before.right), (after.right_grey, after.right)
-    disparity_px, confidence = _carry_view((left, right), -1, of_left, share)
-    right_disparity_px, _ = _carry_view((right, left), 1, of_right, share)
+    half = halve(left)
+    cameras = [find_camera_motion(corners, half) for _, corners in matched]
+    of_left = [(frame.left_grey, frame.left) for frame, _ in matched]
+    of_right = [(frame.right_grey, frame.right) for frame, _ in matched]
+    disparity_px, confidence = _carry_view((left, right), -1, of_left, cameras, share)
+    right_disparity_px, _ = _carry_view((right, left), 1, of_right, cameras, share)
     return Estimate(
         disparity_px=disparity_px,
         right_disparity_px=right_disparity_px,
@@ -101,7 +106,8 @@ def _carry(pair: StereoPair, before: FilteredFrame, after: FilteredFrame, share:
 def _carry_view(
     greys: tuple[UInt8[np.ndarray, "h w"], UInt8[np.ndarray, "h w"]],
     towards: int,
-    matched: tuple[tuple[np.ndarray, Track], tuple[np.ndarray, Track]],
+    matched: Sequence[tuple[np.ndarray, Track]],
+    cameras: Sequence[np.ndarray | None],
     share: float,
 ) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
     """Return a view's disparity and confidence.
@@ -110,14 +116,29 @@ def _carry_view(
         greys: This view and the other one.
         towards: Direction to the match in the other view: -1 for left, 1 for right.
         matched: This view's grey image and track in the matched frames before and after.
+        cameras: Camera motions from these frames to this one (`find_camera_motion`).
         share: Time of the frame between the two.
     """
     own, other = greys
-    half = halve(own)
     before, after = (
-        Source(grey, track.disparity_px, track.confidence, find_flow(halve(grey), half))
-        for grey, track in matched
+        Source(grey, track.disparity_px, track.confidence, _find_places(own, grey, track, camera, towards > 0))
+        for (grey, track), camera in zip(matched, cameras, strict=True)
     )
     disparity_px, confidence = np.empty(own.shape, np.float32), np.empty(own.shape, np.float32)
     take_pixels(own, other, towards, before, after, share, WEIGHTS, disparity_px, confidence)
     return disparity_px, confidence
+
+
+def _find_places(
+    own: UInt8[np.ndarray, "h w"],
+    grey: UInt8[np.ndarray, "h w"],
+    track: Track,
+    camera: Float64[np.ndarray, "4 4"] | None,
+    right: bool,
+) -> Int32[np.ndarray, "h w"]:
+    """Return the index of the pixel of a matched frame that each pixel of a view shows."""
+    moved = move_points(camera, track, right)
+    motion = measure_motion(halve(grey), halve(own), moved.path)
+    places = np.empty(own.shape, np.int32)
+    locate(motion, moved.source, places)
+    return places

@@ -19,13 +19,13 @@ class Source(typing.NamedTuple):
     Attributes:
         grey: uint8 [H, W].
         disparity_px, confidence: float32 [H, W].
-        to_source_px: float32 [H2, W2, 2], offset from every second pixel to its position in this frame.
+        places: int32 [H, W], index of the pixel of this frame that each pixel of the other frame shows.
     """
 
     grey: np.ndarray
     disparity_px: np.ndarray
     confidence: np.ndarray
-    to_source_px: np.ndarray
+    places: np.ndarray
 
 
 @kernel
@@ -41,17 +41,14 @@ def take_pixels(own, other, towards, before, after, share, weights, disparity_px
     of a window's pixel by its grey difference from the centre.
     """
     height, width = own.shape
-    before_to_px, before_grey = before.to_source_px, before.grey
+    before_places, before_grey = before.places, before.grey
     before_disparity_px, before_confidence = before.disparity_px, before.confidence
-    after_to_px, after_grey = after.to_source_px, after.grey
+    after_places, after_grey = after.places, after.grey
     after_disparity_px, after_confidence = after.disparity_px, after.confidence
     for y in range(height):
         for x in range(width):
-            i, j = y // 2, x // 2
-            row = min(max(int(round(y + before_to_px[i, j, 1])), 0), height - 1)
-            column = min(max(int(round(x + before_to_px[i, j, 0])), 0), width - 1)
-            later_row = min(max(int(round(y + after_to_px[i, j, 1])), 0), height - 1)
-            later_column = min(max(int(round(x + after_to_px[i, j, 0])), 0), width - 1)
+            row, column = before_places[y, x] // width, before_places[y, x] % width
+            later_row, later_column = after_places[y, x] // width, after_places[y, x] % width
             from_px, to_px = before_disparity_px[row, column], after_disparity_px[later_row, later_column]
             certain, later = before_confidence[row, column], after_confidence[later_row, later_column]
             part = np.float32(share)
@@ -78,6 +75,26 @@ def take_pixels(own, other, towards, before, after, share, weights, disparity_px
                 part = np.float32(0) if apart <= later_apart else np.float32(1)
             disparity_px[y, x] = from_px + part * (to_px - from_px)
             confidence[y, x] = certain + part * (later - certain)
+
+
+@kernel
+@typing.no_type_check
+def locate(motion, source, places):
+    """Write the index of the pixel of another frame that each pixel shows to `places` [H, W].
+
+    It is the point of `source` (`splat_kernels.splat`) where the camera's motion explains the image, else where
+    optical flow leads.
+    """
+    to_before_px, explained, rests = motion.to_before_px, motion.explained, motion.rests
+    height, width = places.shape
+    for y in range(height):
+        for x in range(width):
+            i, j = y // 2, x // 2
+            places[y, x] = source[y, x]
+            if source[y, x] < 0 or not rests[i, j] or not explained[i, j]:
+                row = min(max(int(round(y + to_before_px[i, j, 1])), 0), height - 1)
+                column = min(max(int(round(x + to_before_px[i, j, 0])), 0), width - 1)
+                places[y, x] = row * width + column
 
 
 @inlined

@@ -17,6 +17,7 @@ _EXPLAINED, _LEAST_LEVELS, _NOISIEST_LEVELS = 1.5, 0.5, 6.0
 _REST, _REST_LEVELS = 1.1, 0.25
 # A pixel is calm if nothing moves in the window of this size around it.
 _CALM_PX = 9
+K_ALLOW,K_REST,K_RESTL,K_RESTC,K_MED=0.3,1.25,0.5,0.25,5
 # This filter is zero on a plane. Gaussian noise with a standard deviation of one level gives a standard
 # deviation of 6 levels, and a median absolute value of 0.674 * 6 levels.
 _ROUGHNESS = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
@@ -42,12 +43,26 @@ class Motion(typing.NamedTuple):
         calm: bool, true where nothing moves nearby.
         explained_share: Share of the windows with contrast that are explained; 1 if almost no window has
             contrast.
+        rests: bool, true where the camera's motion explains the image as well as any other motion.
     """
 
     to_before_px: np.ndarray
     explained: np.ndarray
     calm: np.ndarray
     explained_share: float
+    rests: np.ndarray
+
+
+class CameraPath(typing.NamedTuple):
+    """Motion of a view's points if only the camera moves; arrays have half the image size, rounded up.
+
+    Attributes:
+        to_before_px: float32 [H2, W2, 2], as in `Motion`.
+        known: bool, false where the previous image did not show the point.
+    """
+
+    to_before_px: np.ndarray
+    known: np.ndarray
 
 
 class _Flow(typing.NamedTuple):
@@ -85,14 +100,38 @@ def find_flow(
     return 2 * _find_flow(_match_brightness(before, grey), grey).to_before_px
 
 
-def measure_motion(before: UInt8[np.ndarray, "h2 w2"], grey: UInt8[np.ndarray, "h2 w2"]) -> Motion:
-    """Measure the motion from a grey image back to the previous image, both at half size."""
-    flow, least_levels, rests = _find_flow(_match_brightness(before, grey), grey)
+def measure_motion(
+    before: UInt8[np.ndarray, "h2 w2"],
+    grey: UInt8[np.ndarray, "h2 w2"],
+    camera_path: CameraPath | None = None,
+) -> Motion:
+    """Measure the motion from a grey image back to the previous image, both at half size.
+
+    Args:
+        before: The previous image.
+        grey: The image.
+        camera_path: Where points would have been if only the camera moved; None if it rests.
+    """
+    before = _match_brightness(before, grey)
+    flow, least_levels, rests = _find_flow(before, grey)
     median_levels = min(float(np.median(least_levels[::4, ::4])), _NOISIEST_LEVELS)
-    explained = least_levels <= _EXPLAINED * median_levels + _LEAST_LEVELS
-    around = np.ones((_CALM_PX, _CALM_PX), np.uint8)
-    calm = cv2.erode((rests & explained).astype(np.uint8), around).astype(bool)
-    return Motion(2 * flow, explained, calm, _measure_explained_share(grey, least_levels, explained))
+    allowed_levels = _EXPLAINED * median_levels + _LEAST_LEVELS
+    if camera_path is None:
+        explained = least_levels <= allowed_levels
+        moves = ~(rests & explained)
+    else:
+        known = camera_path.known
+        camera_levels = _measure_difference_levels(grey, _warp(before, camera_path.to_before_px / 2))
+        # Resampling errors grow with contrast.
+        allowed_levels = allowed_levels + K_ALLOW * _measure_contrast_levels(grey)
+        rests = known & (camera_levels <= np.maximum(K_REST * least_levels + K_RESTL, _REST*least_levels+K_RESTC*_measure_contrast_levels(grey)))
+        least_levels = np.where(known, np.minimum(least_levels, camera_levels), least_levels)
+        flow[rests] = camera_path.to_before_px[rests] / 2
+        explained = least_levels <= allowed_levels
+        # What the camera uncovers is new, but does not move. Speckles are noise.
+        moves = cv2.medianBlur((known & ~(rests & explained)).astype(np.uint8), K_MED).astype(bool)
+    calm = cv2.erode((~moves).astype(np.uint8), np.ones((_CALM_PX, _CALM_PX), np.uint8)).astype(bool)
+    return Motion(2 * flow, explained, calm, _measure_explained_share(grey, least_levels, explained), rests)
 
 
 def _find_flow(before: UInt8[np.ndarray, "h2 w2"], grey: UInt8[np.ndarray, "h2 w2"]) -> _Flow:
@@ -118,15 +157,20 @@ def _measure_explained_share(
     explained: Bool[np.ndarray, "h2 w2"],
 ) -> float:
     """Return the share of windows with contrast that are explained; 1 if almost no window has contrast."""
-    window = (_WINDOW_PX, _WINDOW_PX)
-    squares = cv2.sqrBoxFilter(grey, cv2.CV_32F, window)
-    variance = squares - cv2.boxFilter(grey, cv2.CV_32F, window) ** 2
-    contrast_levels = np.sqrt(np.maximum(variance, 0))
+    contrast_levels = _measure_contrast_levels(grey)
     has_contrast = contrast_levels > _CONTRAST * _estimate_noise_levels(grey) + _CONTRAST_LEVELS
     if has_contrast.mean() < _LEAST_CONTRAST_SHARE:
         return 1.0
     alike = explained & (least_levels < _DIFFERENT_SHARE * contrast_levels)
     return float(alike[has_contrast].mean())
+
+
+def _measure_contrast_levels(grey: UInt8[np.ndarray, "h2 w2"]) -> Float[np.ndarray, "h2 w2"]:
+    """Return the standard deviation of the grey levels in a window around each pixel."""
+    window = (_WINDOW_PX, _WINDOW_PX)
+    squares = cv2.sqrBoxFilter(grey, cv2.CV_32F, window)
+    variance = squares - cv2.boxFilter(grey, cv2.CV_32F, window) ** 2
+    return np.sqrt(np.maximum(variance, 0))
 
 
 def _estimate_noise_levels(grey: UInt8[np.ndarray, "h2 w2"]) -> float:

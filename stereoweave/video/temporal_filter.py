@@ -12,6 +12,7 @@ the majority of frames decides. Moving objects therefore leave no trail.
 import typing
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import cv2
 import numpy as np
@@ -20,6 +21,8 @@ from jaxtyping import Bool, Float, UInt8
 from stereoweave.errors import StereoweaveError
 from stereoweave.stereo import Estimate
 from stereoweave.system.threads import thread_count
+from stereoweave.video.camera_motion import find_corners
+from stereoweave.video.moved_points import MovedPoints, find_camera_motion, move_points
 from stereoweave.video.motion import CUT_SHARE, Motion, convert_to_grey, halve, measure_motion
 from stereoweave.video.temporal_kernels import SAME_PX, SAME_SHARE, Track, blend, carry, measure_drift
 
@@ -93,7 +96,8 @@ class TemporalFilter:
         confidences = (estimate.confidence, np.ones_like(estimate.confidence))
         disparities_px = (estimate.disparity_px, estimate.right_disparity_px)
         new_tracks = [
-            Track(*maps, np.ones_like(maps[0])) for maps in zip(disparities_px, confidences, strict=True)
+            Track(*maps, np.ones_like(maps[0]), np.zeros((*maps[0].shape, 2), np.float32))
+            for maps in zip(disparities_px, confidences, strict=True)
         ]
         continued = self._filter_tracks(before, new_tracks) if before else None
         if before and continued is None:
@@ -138,23 +142,33 @@ class TemporalFilter:
         if new_tracks[0].frames.shape != self._tracks[0].frames.shape:
             return None
         with ThreadPoolExecutor(self._threads) as pool:
-            motions = list(pool.map(measure_motion, map(halve, before), map(halve, self._greys)))
+            halves, old_halves = [*map(halve, self._greys)], [*map(halve, before)]
+            camera = find_camera_motion(
+                find_corners(old_halves[0], self._tracks[0].disparity_px), halves[0]
+            )
+            moved = list(pool.map(partial(move_points, camera), self._tracks, (False, True)))
+            paths = [points.path for points in moved]
+            motions = list(pool.map(measure_motion, old_halves, halves, paths))
             if np.mean([motion.explained_share for motion in motions]) < CUT_SHARE:
                 return None
             # The match of a pixel is further left in the right view, and further right in the left view.
-            expected = list(pool.map(_predict, self._tracks, new_tracks, motions, motions[::-1], (-1, 1)))
+            views = zip(motions, moved, strict=True)
+            expected = list(pool.map(_predict, self._tracks, new_tracks, views, motions[::-1], (-1, 1)))
             if _is_contradicted(new_tracks, expected):
                 return None
             return list(pool.map(_update, new_tracks, expected))
 
 
-def _predict(track: Track, new: Track, motion: Motion, other: Motion, towards: int) -> Expectation:
+def _predict(
+    track: Track, new: Track, view: tuple[Motion, MovedPoints], other: Motion, towards: int
+) -> Expectation:
     """Predict the new frame of a view from its track.
 
-    `towards` is the direction to the match in the other view: -1 for left, 1 for right.
+    `view` is how the view moved; `towards` is the direction to the match in the other view: -1 for left, 1 for right.
     """
     carried = Track(*(np.empty_like(values) for values in track))
-    carry(new.disparity_px, track, motion, carried)
+    motion, moved = view
+    carry(new.disparity_px, track, motion, moved.source, moved.offset_px, carried)
     drift_px = np.empty(motion.calm.shape, np.float32)
     measure_drift(new.disparity_px, carried, drift_px)
     calm = motion.calm & _find_calm_matches(other.calm, carried.disparity_px[::2, ::2], towards)

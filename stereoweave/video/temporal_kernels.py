@@ -24,29 +24,44 @@ class Track(typing.NamedTuple):
         confidence: Mean confidence; a frame that contradicts the mean counts as 0.
         frames: Number of frames in the mean, minus the number that contradicted the mean afterwards; 0 where
             the disparity is unknown.
+        offset_px: float32 [H, W, 2], place of the point to the right of and below the pixel's centre.
     """
 
     disparity_px: np.ndarray
     confidence: np.ndarray
     frames: np.ndarray
+    offset_px: np.ndarray
 
 
 @kernel
 @typing.no_type_check
-def carry(new_px, track, motion, carried):
+def carry(new_px, track, motion, source, source_offset_px, carried):
     """Warp `track` to the new frame and write it to `carried`, with 0 frames where nothing is known.
+
+    Where the camera's motion explains the image, a pixel takes the point of `source` (`splat_kernels.splat`).
 
     Motion is not accurate to the pixel. Outside calm areas, each pixel therefore takes its value from
     whichever of the nine pixels around its previous position has the disparity closest to `new_px` [H, W].
     """
     old_px, old_confidence, old_frames = track.disparity_px, track.confidence, track.frames
     disparity_px, confidence, frames = carried.disparity_px, carried.confidence, carried.frames
-    to_before_px, explained, calm = motion.to_before_px, motion.explained, motion.calm
+    offset_px = carried.offset_px
+    to_before_px, explained, calm, rests = motion.to_before_px, motion.explained, motion.calm, motion.rests
     height, width = new_px.shape
     for y in range(height):
         for x in range(width):
             i, j = y // 2, x // 2
             disparity_px[y, x] = confidence[y, x] = frames[y, x] = 0.0
+            offset_px[y, x, 0] = offset_px[y, x, 1] = 0.0
+            index = source[y, x]
+            if index >= 0 and rests[i, j] and explained[i, j]:
+                row, column = index // width, index % width
+                disparity_px[y, x] = old_px[row, column]
+                confidence[y, x] = old_confidence[row, column]
+                frames[y, x] = old_frames[row, column]
+                offset_px[y, x, 0] = source_offset_px[y, x, 0]
+                offset_px[y, x, 1] = source_offset_px[y, x, 1]
+                continue
             row = int(round(y + to_before_px[i, j, 1]))
             column = int(round(x + to_before_px[i, j, 0]))
             if not explained[i, j] or row < 0 or row >= height or column < 0 or column >= width:
@@ -105,12 +120,14 @@ def blend(new, carried, calm, drift_px, mean):
     new_px, new_confidence = new.disparity_px, new.confidence
     old_px, old_confidence, old_frames = carried.disparity_px, carried.confidence, carried.frames
     disparity_px, confidence, frames = mean.disparity_px, mean.confidence, mean.frames
+    old_offset_px, offset_px = carried.offset_px, mean.offset_px
     height, width = new_px.shape
     for y in range(height):
         for x in range(width):
             expected_px = old_px[y, x] + drift_px[y // 2, x // 2]
             apart_px = new_px[y, x] - expected_px
             count = old_frames[y, x]
+            offset_px[y, x, 0], offset_px[y, x, 1] = old_offset_px[y, x, 0], old_offset_px[y, x, 1]
             if count > 0 and abs(apart_px) > SAME_PX + SAME_SHARE * abs(new_px[y, x]):
                 if calm[y // 2, x // 2]:
                     disparity_px[y, x] = expected_px
@@ -118,6 +135,8 @@ def blend(new, carried, calm, drift_px, mean):
                     frames[y, x] = count - 1.0
                     continue
                 count = 0.0
+            if count == 0.0:
+                offset_px[y, x, 0] = offset_px[y, x, 1] = 0.0
             count = min(count + 1.0, MOST_FRAMES)
             share = 1.0 / count
             disparity_px[y, x] = new_px[y, x] - (1.0 - share) * apart_px

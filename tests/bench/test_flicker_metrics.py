@@ -11,7 +11,7 @@ from stereoweave.bench.flicker import (
     average_rows,
     score_flicker,
 )
-from stereoweave.bench.flicker_metrics import find_seen_again, flicker
+from stereoweave.bench.flicker_metrics import find_seen_again, find_thin, flicker, jumps_share
 from stereoweave.bench.flicker_videos import (
     LEFT,
     MIDDLE,
@@ -73,8 +73,28 @@ def test_flicker_of_an_image_is_the_mean_over_its_channels():
     assert flicker(before, after, REST, np.array([[False, True, False, False]])) == 6.0
 
 
-def test_flicker_without_points_is_nan():
+def test_flicker_and_jumps_without_points_are_nan():
     assert np.isnan(flicker(row(1, 2, 3, 4), row(1, 2, 3, 4), REST, ~ALL))
+    assert np.isnan(jumps_share(row(1, 2, 3, 4), row(1, 2, 3, 4), REST, ~ALL))
+
+
+def test_a_jump_is_a_change_that_is_off_by_more_than_two_pixels():
+    before_px, after_px = row(5, 5, 5, 5), row(7, 7.5, 2, 9)
+    assert jumps_share(before_px, after_px, REST, ALL) == 3 / 4
+    # The first and the last point came 2 and 4 px nearer, which is true of the last one alone.
+    assert jumps_share(before_px, after_px, REST, ALL, row(0, 0, 0, 4)) == 2 / 4
+    visible = np.array([[True, True, True, False]])
+    assert jumps_share(row(9, 1, 1, 1), row(0, 9, 1, 1), to_the_right(1, 1, 1, 1), visible) == 0
+    assert jumps_share(row(9, 1, 1, 1), row(0, 9, 1, 1), REST, visible) == 2 / 3
+
+
+def test_thin_things_are_those_in_front_into_which_no_square_of_seven_pixels_fits():
+    truth_px = np.full((40, 60), 10, np.float32)
+    truth_px[:, 5:11] = 30  # a post 6 px wide
+    truth_px[10:17, 20:50] = 30  # a beam 7 px high
+    truth_px[30:33, 20:50] = 12  # a thin thing that is hardly in front
+    truth_px[20:24, 20:24] = 2  # a hole
+    np.testing.assert_array_equal(np.unique(np.nonzero(find_thin(truth_px))[1]), np.arange(5, 11))
 
 
 def test_frames_of_two_sizes_and_points_that_leave_are_refused(without_shape_checks):
@@ -208,6 +228,7 @@ def test_the_rows_show_the_effect_of_the_temporal_filter():
     assert [row.method for row in rows] == [FRAME_BY_FRAME, STEADY, CARRIED] * 4
     for by_frame, steady, carried in zip(rows[::3], rows[1::3], rows[2::3], strict=True):
         assert carried.flicker_px < steady.flicker_px < by_frame.flicker_px
+        assert max(carried.jumps_share, steady.jumps_share) < by_frame.jumps_share
         assert steady.epe_px < 1.01 * by_frame.epe_px
         assert carried.epe_px < 1.03 * by_frame.epe_px
         assert min(steady.time_ms, carried.time_ms) > 0
@@ -223,10 +244,12 @@ def test_a_video_of_one_frame_is_refused():
 
 def test_means_are_over_the_scenes_of_a_video_and_a_method():
     def row(scene, method, value):
-        numbers = dict.fromkeys(("view_flicker_levels", "epe_px", "moving_epe_px", "uncovered_epe_px"), value)
+        names = "jumps_share view_flicker_levels epe_px moving_epe_px outline_epe_px uncovered_epe_px"
+        numbers = dict.fromkeys([*names.split(), "edge_epe_px", "bad2_percent"], value)
         return FlickerRow(
             film="still", scene=scene, model="small", method=method, width_px=8, height_px=6, frames=3,
-            noise_levels=4.0, flicker_px=value, time_ms=float("nan"), **numbers,
+            noise_levels=4.0, flicker_px=value, thin_epe_px=float("nan") if scene == "b" else value,
+            time_ms=float("nan"), **numbers,
         )  # fmt: skip
 
     found = average_rows([row("a", STEADY, 1.0), row("a", FRAME_BY_FRAME, 5.0), row("b", STEADY, 2.0)])
@@ -234,3 +257,4 @@ def test_means_are_over_the_scenes_of_a_video_and_a_method():
         ("still, steady", "mean", 1.5),
         ("still, frame by frame", "mean", 5.0),
     ]
+    assert found[0].thin_epe_px == 1.0 and np.isnan(found[0].time_ms)

@@ -1,0 +1,55 @@
+"""Points of a frame as the camera's motion moves them to another frame."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Float64, UInt8
+
+from stereoweave.video.camera_motion import TrackedCorners, fit_camera_motion
+from stereoweave.video.motion import CameraPath
+from stereoweave.video.splat_kernels import find_places, splat
+from stereoweave.video.temporal_kernels import Track
+
+# A camera that moves its picture by less than this rests.
+_LEAST_MOTION_PX = 0.1
+
+
+class MovedPoints(NamedTuple):
+    """Points of a view in another frame.
+
+    Attributes:
+        source: int32 [H, W], index of the pixel whose point each pixel of the other frame shows; -1 if none.
+        offset_px: float32 [H, W, 2], place of the point to the right of and below the pixel's centre.
+        path: Where the points come from, at half size; None if the camera rests or its motion is unknown.
+    """
+
+    source: np.ndarray
+    offset_px: np.ndarray
+    path: CameraPath | None
+
+
+def find_camera_motion(
+    corners: TrackedCorners, grey: UInt8[np.ndarray, "h2 w2"]
+) -> Float64[np.ndarray, "4 4"] | None:
+    """Return the matrix of `fit_camera_motion`, or None if the camera rests or its motion is unknown."""
+    matrix = fit_camera_motion(corners, grey)
+    if matrix is None:
+        return None
+    points = corners.points * [corners.width_px, corners.width_px, 1, 0.1 * corners.width_px]
+    there = points @ matrix.T
+    moved_px = np.hypot(*(there[:, :2] / there[:, 2:3] - points[:, :2]).T)
+    return matrix if np.percentile(moved_px, 90) > _LEAST_MOTION_PX else None
+
+
+def move_points(matrix: Float64[np.ndarray, "4 4"] | None, track: Track, right: bool) -> MovedPoints:
+    """Move a view's points to another frame."""
+    height, width = track.disparity_px.shape
+    if matrix is None:
+        return MovedPoints(np.full((height, width), -1, np.int32), np.zeros((1, 1, 2), np.float32), None)
+    source, nearest_px = np.empty((height, width), np.int32), np.empty((height, width), np.float32)
+    offset_px = np.empty((height, width, 2), np.float32)
+    splat(matrix, float(right), track.disparity_px, track.offset_px, nearest_px, source, offset_px)
+    half = (height + 1) // 2, (width + 1) // 2
+    path = CameraPath(np.empty((*half, 2), np.float32), np.empty(half, bool))
+    find_places(source, track.offset_px, offset_px, path.to_before_px, path.known)
+    return MovedPoints(source, offset_px, path)
