@@ -9,7 +9,7 @@ import os
 import shutil
 import struct
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
@@ -101,6 +101,11 @@ class VideoMarks:
                 f"expected -100 to 100 percent, found {self.adjustment_percent}", setting="adjustment_percent"
             )
 
+    @property
+    def is_panorama(self) -> bool:
+        """Whether the views cover a sphere, or a part of it, equirectangularly."""
+        return self.projection in _COVERED_DEG
+
 
 class _Box(NamedTuple):
     """A box: its type, its content, and all of its bytes. The type is empty for bytes that are no box."""
@@ -151,6 +156,20 @@ def write_marks(path: Path, marks: VideoMarks) -> None:
         ) from error
 
 
+def show_bounds(marks: VideoMarks) -> VideoMarks:
+    """Return the marks of a panorama with the bounds of its picture in place of Apple's name for them.
+
+    FFmpeg writes a projection to Matroska only with bounds.
+    """
+    width_deg, height_deg = _find_covered_deg(marks)
+    return replace(
+        marks,
+        projection="equirectangular",
+        field_of_view_deg=width_deg,
+        vertical_field_of_view_deg=height_deg,
+    )
+
+
 def mark_index(index: bytes, marks: VideoMarks, *, moved_from: int | None = None) -> bytes:
     """Return the box `moov` with the marks in its video track.
 
@@ -187,17 +206,16 @@ def mark_index(index: bytes, marks: VideoMarks, *, moved_from: int | None = None
 
 def make_boxes(marks: VideoMarks) -> tuple[bytes, bytes]:
     """Return the boxes for a sample description: `st3d` and `sv3d`, and `vexu` and `hfov`."""
-    is_panorama = marks.projection in _COVERED_DEG
     mode, swapped_mode, packing = _PACKINGS[marks.packing]
     google = b""
     stereo_mode = swapped_mode if marks.right_first else mode
-    if stereo_mode is not None and (marks.packing or is_panorama):
+    if stereo_mode is not None and (marks.packing or marks.is_panorama):
         google += _make_full_box(b"st3d", bytes([stereo_mode]))
-    if is_panorama:
+    if marks.is_panorama:
         google += _make_sv3d(marks)
     parts = []
     # A part of a sphere is neither the whole nor the half one that Apple's names mean.
-    is_part = is_panorama and _find_covered_deg(marks) != _COVERED_DEG[marks.projection]
+    is_part = marks.is_panorama and _find_covered_deg(marks) != _COVERED_DEG[marks.projection]
     if marks.projection != "rectilinear" and not is_part:
         kind = _make_full_box(b"prji", _PROJECTIONS[marks.projection])
         parts.append(make_box(b"proj", kind))
