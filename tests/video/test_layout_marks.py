@@ -23,7 +23,9 @@ def run(*words):
 def stereo_3d(path):
     """Return FFmpeg's AVStereo3D as a list, but for the primary eye."""
     with av.open(str(path)) as container:
-        data = next(container.decode(video=0)).side_data[Type.STEREO3D]
+        side_data = next(container.decode(video=0)).side_data
+    # The container's comes first, then what H.264 itself says.
+    data = next(side_data[at] for at in range(len(side_data)) if side_data[at].type == Type.STEREO3D)
     numbers = np.frombuffer(bytes(data), np.int32).tolist()
     return [*numbers[:3], *numbers[4:]]
 
