@@ -12,7 +12,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Num, UInt8
 from PIL import Image
 
 from stereoweave.errors import Remedy, StereoweaveError
@@ -339,7 +339,7 @@ def _render_eyes(renderer: Renderer) -> list[UInt8[np.ndarray, "h w 3"]]:
     return list(render_views(renderer, (0.0, 1.0)))
 
 
-def squeeze(eye: UInt8[np.ndarray, "h w 3"], axis: int) -> UInt8[np.ndarray, "h2 w2 3"]:
+def squeeze(eye: Num[np.ndarray, "h w 3"], axis: int) -> Num[np.ndarray, "h2 w2 3"]:
     """Squeeze an image to half its size along an axis by averaging neighbouring pixels.
 
     If the side along this axis is odd, the last row or column is repeated.

@@ -18,7 +18,7 @@ _UNTAGGED = 0, 2  # AVCOL_SPC_RGB, which some encoders write for "unknown", and 
 # AVColorTransferCharacteristic of HDR, and AVCOL_PRI_BT709.
 _PQ, _HLG = 16, 18
 _HDR = {_PQ: "PQ", _HLG: "HLG"}
-_PRIMARIES_BT709 = 1
+_PRIMARIES_BT709, _PRIMARIES_BT2020 = 1, 9
 
 # Luminance of a white surface and of the brightest highlights (ITU-R BT.2408). The first becomes SDR's peak.
 _WHITE_NITS, _PEAK_NITS = 203.0, 1000.0
@@ -43,9 +43,27 @@ def convert_to_rgb(frame: "av.VideoFrame") -> UInt8[np.ndarray, "h w 3"]:
     return np.ascontiguousarray(np.rot90(picture, frame.rotation // 90))
 
 
+def convert_to_fine(frame: "av.VideoFrame") -> Float32[np.ndarray, "h w 3"]:
+    """Return a frame upright, as RGB in the file's own colours, HDR too; black is 0 and white 255."""
+    codes = _decode_rgb(frame, "rgb48le").astype(np.float32)
+    codes *= 255 / _WHITE_CODE
+    return np.ascontiguousarray(np.rot90(codes, frame.rotation // 90))
+
+
 def name_hdr(frame: "av.VideoFrame") -> str | None:
     """Return the name of a frame's HDR transfer function, PQ or HLG; None for an ordinary frame."""
     return _HDR.get(frame.color_trc)
+
+
+def hdr_colours(frame: "av.VideoFrame") -> tuple[int, int, int] | None:
+    """Return the primaries, transfer function and matrix of an HDR frame, by FFmpeg's numbers; else None.
+
+    Primaries that the file does not state are those of BT.2020.
+    """
+    if frame.color_trc not in _HDR:
+        return None
+    primaries = _PRIMARIES_BT2020 if frame.color_primaries in _UNTAGGED else frame.color_primaries
+    return primaries, frame.color_trc, _BT2020
 
 
 def _decode_rgb(frame: "av.VideoFrame", format: str) -> np.ndarray:

@@ -83,9 +83,8 @@ class VideoMarks:
             ("projection", self.projection, _PROJECTIONS),
         ):
             if value not in known:
-                raise StereoweaveError(
-                    f"expected one of {', '.join(map(str, known))}, found {value!r}", setting=name
-                )
+                choices = ", ".join(map(str, known))
+                raise StereoweaveError(f"{name}: expected one of {choices}, found {value!r}")
         whole_deg = _COVERED_DEG.get(self.projection, (_MOST_DEG, 0.0))
         for name, number, most in (
             ("field_of_view_deg", self.field_of_view_deg, whole_deg[0]),
@@ -93,12 +92,10 @@ class VideoMarks:
             ("baseline_m", self.baseline_m, _MOST_BASELINE_M),
         ):
             if number is not None and not 0 < number <= most:
-                raise StereoweaveError(
-                    f"expected a number above 0 and at most {most:g}, found {number}", setting=name
-                )
+                raise StereoweaveError(f"{name}: expected above 0 and at most {most:g}, found {number}")
         if not abs(self.adjustment_percent) <= 100:
             raise StereoweaveError(
-                f"expected -100 to 100 percent, found {self.adjustment_percent}", setting="adjustment_percent"
+                f"adjustment_percent: expected -100 to 100 percent, found {self.adjustment_percent}"
             )
 
     @property
