@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Num, UInt8
 from PIL import Image
 
 from stereoweave.errors import Remedy, StereoweaveError
@@ -89,8 +89,8 @@ class LayoutOptions:
             )
 
 
-Eye: TypeAlias = UInt8[np.ndarray, "_ _ 3"]
-"""View of one eye, or both joined in one image; uint8 RGB."""
+Eye: TypeAlias = Num[np.ndarray, "_ _ 3"]
+"""View of one eye, or both arranged in one image: RGB, uint8, or float32 from 0 to 255."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,8 +99,8 @@ class Layout:
 
     Attributes:
         compose: Function that returns the image, uint8 RGB.
-        join: Function that returns the image from the views of the left and the right eye; None if the
-            layout shows more than these.
+        join: Function that arranges the views of the left and the right eye in the image; None if the layout
+            shows others, or mixes them.
         positions: Outermost positions of the layout's views.
         converged: Whether views are overlaid or compared in place, so the middle of the scene should have no
             parallax.
@@ -175,13 +175,13 @@ def join_top_bottom_half(left: Eye, right: Eye) -> Eye:
 
 
 def make_anaglyph(kind: str) -> Callable[[Eye, Eye], Eye]:
-    """Return the `join` function of a red-cyan anaglyph, with red for the left eye.
+    """Return the function that mixes both eyes' views in a red-cyan anaglyph, with red for the left eye.
 
     `kind` is a key of `_ANAGLYPHS`.
     """
     shares = [np.array(matrix, np.float32) for matrix in _ANAGLYPHS[kind]]
 
-    def join(left: Eye, right: Eye) -> Eye:
+    def mix(left: Eye, right: Eye) -> Eye:
         red, cyan = (
             cv2.transform(eye.astype(np.float32), matrix)
             for eye, matrix in zip((left, right), shares, strict=True)
@@ -189,7 +189,7 @@ def make_anaglyph(kind: str) -> Callable[[Eye, Eye], Eye]:
         # Round and clip only the sum, not each eye's part.
         return cv2.add(red, cyan, dtype=cv2.CV_8U)
 
-    return join
+    return mix
 
 
 def rgbd(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
@@ -221,13 +221,17 @@ def contact_sheet(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarra
     return _join_tiles(_render_tiles(renderer, _SHEET_SIDE, _SHEET_SIDE, _SHEET_SIDE))
 
 
-def _join_eyes(join: Callable[[Eye, Eye], Eye], **rest: Any) -> Layout:
-    """Return a layout that shows the views of the left and the right eye and nothing else."""
+def _compose_eyes(join: Callable[[Eye, Eye], Eye]) -> Callable[[Renderer, LayoutOptions], Eye]:
+    """Return the `compose` function of a layout that shows the views of both eyes and nothing else."""
 
     def compose(renderer: Renderer, choices: LayoutOptions) -> Eye:
         return join(*render_views(renderer, (0.0, 1.0)))
 
-    return Layout(compose=compose, join=join, **rest)
+    return compose
+
+
+def _arrange(join: Callable[[Eye, Eye], Eye], **rest: Any) -> Layout:
+    return Layout(compose=_compose_eyes(join), join=join, **rest)
 
 
 def _swing_positions(count: int) -> tuple[float, ...]:
@@ -238,12 +242,15 @@ def _swing_positions(count: int) -> tuple[float, ...]:
 # VR players detect LR, TB and half in file names. The marks of full and crossed layouts follow iw3, the most
 # widely used conversion tool; the mark of a quilt follows Looking Glass.
 LAYOUTS: dict[str, Layout] = {
-    "side_by_side": _join_eyes(join_side_by_side, mark="_LRF_Full_SBS"),
-    "side_by_side_half": _join_eyes(join_side_by_side_half, mark="_half_LR", squeezed=("side_by_side", 1)),
-    "crossed": _join_eyes(join_crossed, mark="_RLF_cross"),
-    "top_bottom": _join_eyes(join_top_bottom, mark="_TBF_fulltb"),
-    "top_bottom_half": _join_eyes(join_top_bottom_half, mark="_half_TB", squeezed=("top_bottom", 0)),
-    **{f"anaglyph_{kind}": _join_eyes(make_anaglyph(kind), converged=True) for kind in _ANAGLYPHS},
+    "side_by_side": _arrange(join_side_by_side, mark="_LRF_Full_SBS"),
+    "side_by_side_half": _arrange(join_side_by_side_half, mark="_half_LR", squeezed=("side_by_side", 1)),
+    "crossed": _arrange(join_crossed, mark="_RLF_cross"),
+    "top_bottom": _arrange(join_top_bottom, mark="_TBF_fulltb"),
+    "top_bottom_half": _arrange(join_top_bottom_half, mark="_half_TB", squeezed=("top_bottom", 0)),
+    **{
+        f"anaglyph_{kind}": Layout(compose=_compose_eyes(make_anaglyph(kind)), converged=True)
+        for kind in _ANAGLYPHS
+    },
     "rgbd": Layout(compose=rgbd, positions=(), mark="_RGBD"),
     "quilt": Layout(compose=quilt, positions=_FAN, converged=True, mark="_qs{columns}x{rows}a{aspect:g}"),
     "contact_sheet": Layout(compose=contact_sheet, positions=_FAN, converged=True),
@@ -348,7 +355,7 @@ def write_picture(path: str | Path, picture: UInt8[np.ndarray, "h w 3"]) -> None
             left.save(temporary, "MPO", save_all=True, append_images=[right], **_FINE)
 
 
-def squeeze(eye: UInt8[np.ndarray, "h w 3"], axis: int) -> UInt8[np.ndarray, "h2 w2 3"]:
+def squeeze(eye: Num[np.ndarray, "h w 3"], axis: int) -> Num[np.ndarray, "h2 w2 3"]:
     """Squeeze an image to half its size along an axis by averaging neighbouring pixels.
 
     If the side along this axis is odd, the last row or column is repeated.

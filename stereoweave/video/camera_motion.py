@@ -44,17 +44,13 @@ class TrackedCorners(NamedTuple):
     width_px: int
 
 
-def find_corners(
-    grey: UInt8[np.ndarray, "h2 w2"], disparity_px: Float[np.ndarray, "h w"]
-) -> TrackedCorners:
+def find_corners(grey: UInt8[np.ndarray, "h2 w2"], disparity_px: Float[np.ndarray, "h w"]) -> TrackedCorners:
     """Return the strongest corner of each cell of a left image at half size, with its disparity."""
     strength = cv2.cornerMinEigenVal(grey, 5)
     height, width = (side // _CELL_PX for side in strength.shape)
     cells = strength[: height * _CELL_PX, : width * _CELL_PX].reshape(height, _CELL_PX, width, _CELL_PX)
     cells = cells.transpose(0, 2, 1, 3).reshape(height, width, _CELL_PX**2)
-    rows, columns = np.indices((height, width)) * _CELL_PX + np.array(
-        np.divmod(cells.argmax(2), _CELL_PX)
-    )
+    rows, columns = np.indices((height, width)) * _CELL_PX + np.array(np.divmod(cells.argmax(2), _CELL_PX))
     strong = cells.max(2) > _LEAST_CORNER
     rows, columns = rows[strong], columns[strong]
     d_px = disparity_px[2 * rows, 2 * columns].astype(np.float64)
@@ -103,7 +99,12 @@ def _normalise(
     columns: np.ndarray, rows: np.ndarray, disparity_px: np.ndarray, width_px: int
 ) -> Float64[np.ndarray, "n 4"]:
     ones = np.ones_like(disparity_px)
-    return np.stack([columns, rows, ones, disparity_px / _DISPARITY_UNIT], 1) / [width_px, width_px, 1, width_px]
+    return np.stack([columns, rows, ones, disparity_px / _DISPARITY_UNIT], 1) / [
+        width_px,
+        width_px,
+        1,
+        width_px,
+    ]
 
 
 def _fit_robustly(

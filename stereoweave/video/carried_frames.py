@@ -69,7 +69,9 @@ def carry_between(
     if not pairs or before is None or after is None:
         return []
     shares = [number / (len(pairs) + 1) for number in range(1, len(pairs) + 1)]
-    matched = [(frame, find_corners(halve(frame.left_grey), frame.left.disparity_px)) for frame in (before, after)]
+    matched = [
+        (frame, find_corners(halve(frame.left_grey), frame.left.disparity_px)) for frame in (before, after)
+    ]
     with ThreadPoolExecutor(min(threads, len(pairs))) as pool:
         return list(pool.map(_carry, pairs, repeat(matched), shares))
 
@@ -121,7 +123,9 @@ def _carry_view(
     """
     own, other = greys
     before, after = (
-        Source(grey, track.disparity_px, track.confidence, _find_places(own, grey, track, camera, towards > 0))
+        Source(
+            grey, track.disparity_px, track.confidence, _find_places(own, grey, track, camera, towards > 0)
+        )
         for (grey, track), camera in zip(matched, cameras, strict=True)
     )
     disparity_px, confidence = np.empty(own.shape, np.float32), np.empty(own.shape, np.float32)

@@ -11,6 +11,7 @@ import numpy as np
 from stereoweave.matching.estimate import match
 from stereoweave.matching.matcher import Matcher
 from stereoweave.matching.options import MatchOptions
+from stereoweave.rendering.fine_layouts import to_16_bits
 from stereoweave.rendering.layouts import Eye
 from stereoweave.stereo import Estimate
 from stereoweave.system.ahead import ahead
@@ -137,7 +138,8 @@ class FrameConverter:
         """Yield output images that show the pictures of both cameras as they are, which needs no matching."""
         for frame, pair in chain.from_iterable(zip(*group, strict=True) for group in groups):
             self.tally.add(frame)
-            yield frame.time, join(pair.left, pair.right)
+            joined = to_16_bits(join(*frame.fine())) if frame.fine else join(pair.left, pair.right)
+            yield frame.time, joined
 
     def _match(self, group: FrameGroup) -> tuple[FrameGroup, Estimate]:
         return group, match(self._matcher, group.pairs[-1], self._options)
@@ -145,7 +147,10 @@ class FrameConverter:
     def _render(self, estimated: EstimatedFrame) -> tuple[Fraction, Picture]:
         frame, pair, estimate = estimated
         self.tally.add(frame)
-        return frame.time, self._squeezed.job.render_frame(pair, estimate, self._seen)
+        job = self._squeezed.job
+        if frame.fine:
+            return frame.time, job.render_fine_frame(frame.fine(), estimate, self._seen)
+        return frame.time, job.render_frame(pair, estimate, self._seen)
 
     def _overlap(self, items: Iterable[Item], count: int) -> Iterator[Item]:
         """Compute items ahead of their use, if more than one thread is allowed."""

@@ -17,7 +17,7 @@ _EXPLAINED, _LEAST_LEVELS, _NOISIEST_LEVELS = 1.5, 0.5, 6.0
 _REST, _REST_LEVELS = 1.1, 0.25
 # A pixel is calm if nothing moves in the window of this size around it.
 _CALM_PX = 9
-K_ALLOW,K_REST,K_RESTL,K_RESTC,K_MED=0.3,1.25,0.5,0.25,5
+K_ALLOW, K_REST, K_RESTL, K_RESTC, K_MED = 0.3, 1.25, 0.5, 0.25, 5
 # This filter is zero on a plane. Gaussian noise with a standard deviation of one level gives a standard
 # deviation of 6 levels, and a median absolute value of 0.674 * 6 levels.
 _ROUGHNESS = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
@@ -124,7 +124,13 @@ def measure_motion(
         camera_levels = _measure_difference_levels(grey, _warp(before, camera_path.to_before_px / 2))
         # Resampling errors grow with contrast.
         allowed_levels = allowed_levels + K_ALLOW * _measure_contrast_levels(grey)
-        rests = known & (camera_levels <= np.maximum(K_REST * least_levels + K_RESTL, _REST*least_levels+K_RESTC*_measure_contrast_levels(grey)))
+        rests = known & (
+            camera_levels
+            <= np.maximum(
+                K_REST * least_levels + K_RESTL,
+                _REST * least_levels + K_RESTC * _measure_contrast_levels(grey),
+            )
+        )
         least_levels = np.where(known, np.minimum(least_levels, camera_levels), least_levels)
         flow[rests] = camera_path.to_before_px[rests] / 2
         explained = least_levels <= allowed_levels

@@ -3,14 +3,16 @@
 import copy
 import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import UInt8
 
-from stereoweave.errors import FormatError, Remedy, StereoweaveError
+from stereoweave.errors import FormatError, Note, Remedy, StereoweaveError
 from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS, detect_layout
 from stereoweave.video.tracks import Shot, Track, VideoTrack, open_track
 
@@ -25,6 +27,9 @@ _AFTER_DAMAGE = "decoded from a damaged frame before it"
 _RETIMED = "its timestamp was missing or a duplicate, so it is shown slightly later"
 
 
+FinePair = tuple[np.ndarray, np.ndarray]
+
+
 class StereoFrame(NamedTuple):
     """Pair of frames from a video.
 
@@ -33,12 +38,20 @@ class StereoFrame(NamedTuple):
         time: Exact time since the start of the video, in seconds.
         problem: Description of damage to this frame, of a changed timestamp, or of an early end of the
             video; None if there is no problem.
+        fine: Function that returns left and right with all their bits and in the file's own colours, HDR too,
+            float32 RGB from 0 to 255; None unless the video reads them.
     """
 
     left: UInt8[np.ndarray, "h w 3"]
     right: UInt8[np.ndarray, "h w 3"]
     time: Fraction
     problem: str | None
+    fine: Callable[[], FinePair] | None = None
+
+    def change_fine(self, change: Callable[[FinePair], FinePair]) -> "StereoFrame":
+        """Return the frame with a change of its fine pictures, which is made when they are needed."""
+        fine = self.fine
+        return self if fine is None else self._replace(fine=lambda: change(fine()))
 
 
 class StereoVideo:
@@ -52,12 +65,13 @@ class StereoVideo:
             different numbers of frames, this is the lower number.
         rate: Average frames per second.
         time_base: Time unit in seconds; every frame time is a multiple of this unit.
-        camera: Camera of the views as a spatial video declares it; None if it is unknown.
+        camera: Camera of the views as the file declares it; None if it is unknown.
         sound: File that contains the sound; None for a silent video.
         excerpted: Name of the part of a longer video that this is, such as "1440+120" for 120 frames from
             frame 1440 on; None for a whole video.
         notes: Notes on views and colours, and on the column or row that is dropped from frames of odd width
             or height.
+        hdr_colours: Primaries, transfer function and matrix of HDR, by FFmpeg's numbers; None for SDR.
         on_frame: Function that `frames` calls with the number of each frame that it yields, to show progress.
     """
 
@@ -75,12 +89,21 @@ class StereoVideo:
         odd = self._split.note_odd_size(*first.size_px) if self._split else []
         self.notes = (*first.notes, *odd)
         self.camera = first.camera
+        if self._split and isinstance(first, VideoTrack):
+            self.camera = first.packed_camera(self.size_px)
         self.frame_count = min(len(track.steps) for track in tracks)
         self.rate, self.time_base = first.rate, first.time_base
         self.sound = next((track.sound for track in tracks if track.sound), None)
         self.on_frame: Callable[[int], None] = lambda number: None
         self.excerpted: str | None = None
         self._first, self._last = 0, self.frame_count - 1
+        self.hdr_colours = first.hdr_colours
+        self._reads_fine = False
+
+    def read_fine(self) -> None:
+        """From now on, yield frames with fine pictures; notes no longer say that HDR is tone-mapped."""
+        self._reads_fine = True
+        self.notes = tuple(_note_kept(note) for note in self.notes)
 
     def excerpt(self, start_s: float, length_s: float) -> "StereoVideo":
         """Return a part of the video as a silent video of its own, whose times and numbers begin at 0.
@@ -119,9 +142,14 @@ class StereoVideo:
             left, right = self._split.eyes(*pictures) if self._split else pictures
             time = (steps[index] - steps[first]) * self.time_base
             self.on_frame(index - first)
-            yield StereoFrame(
-                left, right, time, self._describe_problem(index, [problem for _, problem in seen])
-            )
+            problem = self._describe_problem(index, [problem for _, problem in seen])
+            fine = partial(self._split_fine, [shot for shot, _ in seen]) if self._reads_fine else None
+            yield StereoFrame(left, right, time, problem, fine)
+
+    def _split_fine(self, shots: Sequence[Shot]) -> FinePair:
+        pictures = [picture for shot in shots for picture in shot.fine_pictures()]
+        left, right = self._split.eyes(*pictures) if self._split else pictures
+        return left, right
 
     def _describe_problem(self, index: int, problems: Sequence[str | None]) -> str | None:
         of_two = len(self._tracks) == 2
@@ -194,6 +222,10 @@ def check_unpacked(name: str, format: str | None) -> None:
             f"layers, found {format}",
             remedy=Remedy("leave it out", ("format",)),
         )
+
+
+def _note_kept(note: Note) -> Note:
+    return replace(note, text=note.text.replace("it is tone-mapped to SDR (BT.709)", "it is kept in 10 bits"))
 
 
 def _check_second_view(track: VideoTrack) -> None:

@@ -143,9 +143,7 @@ class TemporalFilter:
             return None
         with ThreadPoolExecutor(self._threads) as pool:
             halves, old_halves = [*map(halve, self._greys)], [*map(halve, before)]
-            camera = find_camera_motion(
-                find_corners(old_halves[0], self._tracks[0].disparity_px), halves[0]
-            )
+            camera = find_camera_motion(find_corners(old_halves[0], self._tracks[0].disparity_px), halves[0])
             moved = list(pool.map(partial(move_points, camera), self._tracks, (False, True)))
             paths = [points.path for points in moved]
             motions = list(pool.map(measure_motion, old_halves, halves, paths))

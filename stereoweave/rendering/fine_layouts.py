@@ -1,0 +1,26 @@
+"""Views and layouts of two views in more than 8 bits."""
+
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Float32, UInt16
+
+from stereoweave.rendering.layouts import Eye
+from stereoweave.rendering.renderer import Renderer
+
+_LEVELS_OF_16_BITS = 65535 / 255
+
+
+def compose_fine(renderer: Renderer, join: Callable[[Eye, Eye], Eye]) -> UInt16[np.ndarray, "h w 3"]:
+    """Return a layout of both eyes' views, from 0 to 65535, arranged by its function `join`."""
+    return to_16_bits(join(renderer.fine_view(0.0), renderer.fine_view(1.0)))
+
+
+def to_16_bits(picture: Float32[np.ndarray, "h w 3"]) -> UInt16[np.ndarray, "h w 3"]:
+    """Return a picture from 0 to 255 as one from 0 to 65535."""
+    return np.clip(np.rint(_LEVELS_OF_16_BITS * picture), 0, 65535).astype(np.uint16)
+
+
+def to_8_bits(picture: Float32[np.ndarray, "h w 3"]) -> np.ndarray:
+    """Return a picture rounded to uint8 [H, W, 3]."""
+    return np.clip(np.rint(picture), 0, 255).astype(np.uint8)
