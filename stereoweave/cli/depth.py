@@ -17,8 +17,12 @@ from stereoweave.cli.options import (
     Calib,
     FocalPx,
     Format,
+    Fov,
+    LensFov,
+    Look,
     Model,
     Pictures,
+    Projection,
     Provider,
     Range,
     Raw,
@@ -26,6 +30,7 @@ from stereoweave.cli.options import (
     Refined,
     Threads,
     make_request,
+    make_sphere_request,
     parse_pixel,
     parse_range_px,
 )
@@ -97,6 +102,10 @@ def depth(  # noqa: PLR0913 - each is an option of the command line
     focal_px: FocalPx = None,
     baseline_m: BaselineM = None,
     rectify: Rectify = None,
+    projection: Projection = None,
+    look: Look = None,
+    fov: Fov = None,
+    lens_fov: LensFov = None,
     range_px: Range = None,
     write: Write = None,
     refined: Refined = False,
@@ -113,7 +122,14 @@ def depth(  # noqa: PLR0913 - each is an option of the command line
     from stereoweave.pictures.pair_finding import find_pairs
 
     job = DepthJob(
-        request=make_request(format, calib, focal_px, baseline_m, rectify),
+        request=make_request(
+            format,
+            calib,
+            focal_px,
+            baseline_m,
+            rectify,
+            make_sphere_request(projection, look, fov, lens_fov),
+        ),
         backend=Backend(model=model, threads=threads, provider=provider),
         options=MatchOptions(range_px=parse_range_px(range_px), refined=refined, raw=raw),
         files=tuple(write or ()),
@@ -160,6 +176,10 @@ def measure(  # noqa: PLR0913 - each is an option of the command line
     focal_error_percent: FocalError = 0.0,
     baseline_error_percent: BaselineError = 0.0,
     rectify: RectifyFirst = False,
+    projection: Projection = None,
+    look: Look = None,
+    fov: Fov = None,
+    lens_fov: LensFov = None,
     range_px: Range = None,
     refined: Refined = False,
     model: Model = "base",
@@ -181,7 +201,8 @@ def measure(  # noqa: PLR0913 - each is an option of the command line
 
     places = parse_pixel("--from", first), parse_pixel("--to", second)
     options = MatchOptions(range_px=parse_range_px(range_px), refined=refined)
-    prepared = prepare(pictures, make_request(format, calib, focal_px, baseline_m, rectify))
+    sphere = make_sphere_request(projection, look, fov, lens_fov)
+    prepared = prepare(pictures, make_request(format, calib, focal_px, baseline_m, rectify, sphere))
     camera = require_camera(prepared.pair)
     height, width = prepared.pair.left.shape[:2]
     check_places((width, height), *places)

@@ -11,8 +11,12 @@ import typer
 from stereoweave.cli.commands import running_options, shows_steps
 from stereoweave.cli.options import (
     Format,
+    Fov,
+    LensFov,
+    Look,
     Model,
     Pictures,
+    Projection,
     Provider,
     Range,
     Rectify,
@@ -20,6 +24,7 @@ from stereoweave.cli.options import (
     Threads,
     make_parent_folder,
     make_request,
+    make_sphere_request,
     parse_largest_size_px,
     parse_range_px,
 )
@@ -113,6 +118,10 @@ def view(  # noqa: PLR0913 - each is an option of the command line
     format: Format = None,
     calib: Calib = None,
     rectify: Rectify = None,
+    projection: Projection = None,
+    look: Look = None,
+    fov: Fov = None,
+    lens_fov: LensFov = None,
     range_px: Range = None,
     model: Model = "base",
     threads: Threads = None,
@@ -147,7 +156,8 @@ def view(  # noqa: PLR0913 - each is an option of the command line
         threads=threads,
     )
     options = MatchOptions(range_px=parse_range_px(range_px), refined=True)
-    prepared = prepare(pictures, make_request(format, calib, rectify=rectify))
+    sphere = make_sphere_request(projection, look, fov, lens_fov)
+    prepared = prepare(pictures, make_request(format, calib, rectify=rectify, sphere=sphere))
     pair = crop_to_content(prepared.pair)
     file = file.add_mark(pair)
     make_parent_folder(file.path)
