@@ -22,6 +22,7 @@ from stereoweave.system.threads import thread_count
 from stereoweave.video.carried_frames import rehearse_carrying
 from stereoweave.video.frame_converter import FrameConverter, VideoTally, load_matcher
 from stereoweave.video.job import VideoJob
+from stereoweave.video.layout_marks import mark_layout
 from stereoweave.video.parts import open_parts
 from stereoweave.video.reader import StereoVideo, format_time
 from stereoweave.video.survey import survey_video
@@ -98,7 +99,14 @@ def convert_video(
             with parts.next(converter.state) as path, closing(converter.convert(part)) as pictures:
                 recorder.write_part(path, map(meter.count, pictures))
         said = job.describe_values(converter.survey, video.camera, rectified=converter.has_warped)
-        recorder.join(parts.files, video.sound, out, said)
+        marks = mark_layout(
+            job.layout,
+            None if converter.has_warped else video.camera,
+            video.size_px[0],
+            strength=job.strength,
+            convergence_px=job.convergence_px or 0.0,
+        )
+        recorder.join(parts.files, video.sound, out, said, marks)
     return replace(converter.tally, frames_per_s=meter.frames_per_s)
 
 

@@ -52,7 +52,7 @@ class StereoVideo:
             different numbers of frames, this is the lower number.
         rate: Average frames per second.
         time_base: Time unit in seconds; every frame time is a multiple of this unit.
-        camera: Camera of the views as a spatial video declares it; None if it is unknown.
+        camera: Camera of the views as the file declares it; None if it is unknown.
         sound: File that contains the sound; None for a silent video.
         excerpted: Name of the part of a longer video that this is, such as "1440+120" for 120 frames from
             frame 1440 on; None for a whole video.
@@ -75,6 +75,8 @@ class StereoVideo:
         odd = self._split.note_odd_size(*first.size_px) if self._split else []
         self.notes = (*first.notes, *odd)
         self.camera = first.camera
+        if self._split and isinstance(first, VideoTrack):
+            self.camera = first.packed_camera(self.size_px)
         self.frame_count = min(len(track.steps) for track in tracks)
         self.rate, self.time_base = first.rate, first.time_base
         self.sound = next((track.sound for track in tracks if track.sound), None)

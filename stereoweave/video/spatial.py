@@ -120,21 +120,38 @@ def is_spatial(frame: "av.VideoFrame") -> bool:
 
 
 def read_stereo3d(frame: "av.VideoFrame") -> Stereo3D | None:
-    """Return what a frame says about its views and cameras; None if it says nothing."""
+    """Return what a frame says about its views and cameras; None if it says nothing.
+
+    Where stream and container both say something, the stream decides how views are packed. It knows of no
+    cameras.
+    """
     from av.sidedata.sidedata import Type
 
     side_data = _read_side_data(frame)
-    stereo3d = bytes(side_data.get(Type.STEREO3D, b""))
-    if len(stereo3d) < _STEREO3D_BYTES:
+    said = _parse_stereo3d(side_data.get(Type.STEREO3D, b""))
+    if said is None:
+        return None
+    if _is_panorama(side_data.get(Type.SPHERICAL)):
+        return replace(said, baseline_m=0.0, adjustment_percent=0.0, field_of_view_deg=0.0)
+    if said.baseline_m or said.field_of_view_deg or len(side_data) == 1:
+        return said
+    # The container's word comes first, and hides behind the stream's.
+    every = [side_data[index] for index in range(len(side_data))]
+    first = _parse_stereo3d(next((data for data in every if data.type == Type.STEREO3D), b"")) or said
+    return replace(first, kind=said.kind, is_inverted=said.is_inverted, view=said.view)
+
+
+def _parse_stereo3d(data: Any) -> Stereo3D | None:
+    numbers = bytes(data)
+    if len(numbers) < _STEREO3D_BYTES:
         return None
     kind, flags, view, _, baseline_um, shift, shift_unit, angle, angle_unit = np.frombuffer(
-        stereo3d[:_STEREO3D_BYTES], np.int32
+        numbers[:_STEREO3D_BYTES], np.int32
     ).tolist()
-    said = Stereo3D(kind, bool(flags & 1), view)
-    if _is_panorama(side_data.get(Type.SPHERICAL)):
-        return said
-    return replace(
-        said,
+    return Stereo3D(
+        kind,
+        bool(flags & 1),
+        view,
         baseline_m=max(baseline_um, 0) / 1e6,
         adjustment_percent=100 * shift / shift_unit if shift_unit else 0.0,
         field_of_view_deg=angle / angle_unit if angle_unit else 0.0,

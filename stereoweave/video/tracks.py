@@ -107,9 +107,14 @@ class VideoTrack:
         # The file does not say whether field of view and baseline are meant before or after a rotation.
         has_camera = self.is_spatial and first.rotation % 360 == 0
         self.camera = declared.camera(self._frame_size_px) if has_camera else None
+        self._packed = declared if first.rotation % 360 == 0 and not self.is_spatial else Stereo3D()
         self.notes = [declared.note()] if self.is_spatial else []
         if hdr := name_hdr(first):
             self.notes.append(Note(f"the video is HDR ({hdr}); it is tone-mapped to SDR (BT.709)"))
+
+    def packed_camera(self, size_px: tuple[int, int]) -> StereoCamera | None:
+        """Return the camera that a video with both views in each frame declares for views of this size."""
+        return self._packed.camera(size_px)
 
     def shots(self, start: int, first: int = 0) -> Iterator[Shot]:
         """Yield the frames that can be decoded, in display order, from a key frame at or before `first` on.

@@ -28,6 +28,7 @@ from jaxtyping import UInt8, UInt16
 
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.files import replacing
+from stereoweave.video.mp4_marks import VideoMarks, show_bounds, write_marks
 
 if TYPE_CHECKING:  # PyAV's types have parameters that its classes lack
     from av.packet import Packet
@@ -112,7 +113,14 @@ class Recorder:
             if stream:
                 part.mux(stream.encode())
 
-    def join(self, parts: Sequence[Path], sound: Path | None, out: Path, metadata: Mapping[str, str]) -> None:
+    def join(
+        self,
+        parts: Sequence[Path],
+        sound: Path | None,
+        out: Path,
+        metadata: Mapping[str, str],
+        marks: VideoMarks | None = None,
+    ) -> None:
         """Join all parts with all audio streams in the file `sound`, copying every packet unchanged.
 
         MP4 and MOV store all times exactly; Matroska rounds them to milliseconds.
@@ -122,11 +130,41 @@ class Recorder:
             sound: Video whose sound and start time are copied; None for a silent video.
             out: Output file; its extension must be in `CONTAINERS`.
             metadata: Metadata of the output file.
+            marks: What the file says about its views and cameras. Matroska holds the packing that
+                `packing` declares, and the bounds of a panorama.
         """
+        with replacing(out) as temporary:
+            if out.suffix.lower() != ".mkv":
+                self._mux(parts, sound, temporary, metadata)
+                if marks is not None:
+                    write_marks(temporary, marks)
+            elif marks is not None and marks.is_panorama:
+                self._mux_panorama(parts, sound, temporary, metadata, marks)
+            else:
+                self._mux(parts, sound, temporary, metadata)
+
+    def _mux_panorama(
+        self,
+        parts: Sequence[Path],
+        sound: Path | None,
+        out: Path,
+        metadata: Mapping[str, str],
+        marks: VideoMarks,
+    ) -> None:
+        """Join all parts in a Matroska file with a projection, which FFmpeg copies from a marked MP4 file."""
+        marked = out.with_suffix(".mp4")
+        try:
+            self._mux(parts, None, marked, {})
+            write_marks(marked, show_bounds(marks))
+            self._mux([marked], sound, out, metadata)
+        finally:
+            marked.unlink(missing_ok=True)
+
+    def _mux(self, parts: Sequence[Path], sound: Path | None, out: Path, metadata: Mapping[str, str]) -> None:
+        """Join all parts with the sound of a file, in a file that nobody reads yet."""
         with ExitStack() as stack:
-            temporary = stack.enter_context(replacing(out))
             options = _EXACT_TIMES | (_EXACT_STARTS if out.suffix.lower() in (".mp4", ".mov") else {})
-            container = stack.enter_context(av.open(str(temporary), "w", options=options))
+            container = stack.enter_context(av.open(str(out), "w", options=options))
             container.metadata.update(metadata)
             first = stack.enter_context(av.open(str(parts[0])))
             stream = container.add_stream_from_template(first.streams.video[0], opaque=True)

@@ -12,6 +12,7 @@ from av.video.reformatter import Interpolation
 from video_examples import example_pairs, write_side_by_side
 
 from stereoweave.errors import StereoweaveError
+from stereoweave.video.mp4_marks import VideoMarks
 from stereoweave.video.writer import GREY16, H264, Packing, Recorder, check_container
 
 # Flags with which FFmpeg decodes colours exactly.
@@ -245,3 +246,20 @@ def two_languages(path: Path) -> Path:
                 container.mux(track.encode(piece))
             container.mux(track.encode())
     return path
+
+
+def test_the_bounds_of_a_panorama_are_kept_in_matroska(tmp_path):
+    shown = list(zip(even_times(3), pictures(3), strict=True))
+    files = [tmp_path / "1.nut"]
+    recorder().write_part(files[0], shown)
+    out = tmp_path / "video.mkv"
+    writing = recorder(packing=Packing("left_right", 3))
+    writing.join(files, None, out, {}, VideoMarks(packing="side_by_side", projection="half_equirectangular"))
+    spherical = np.frombuffer(bytes(first_frame(out).side_data[Type.SPHERICAL]), np.uint32)
+    # AV_SPHERICAL_EQUIRECTANGULAR_TILE without rotation, then the bounds: left, top, right and bottom.
+    assert spherical.tolist() == [2, 0, 0, 0, 1 << 30, 0, 1 << 30, 0, 0]
+    with av.open(str(out)) as container:
+        assert container.streams.video[0].metadata["stereo_mode"] == "left_right"
+    writing.join(files, None, tmp_path / "plain.mkv", {})
+    assert frame_times(out) == frame_times(tmp_path / "plain.mkv")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["1.nut", "plain.mkv", "video.mkv"]

@@ -1,0 +1,429 @@
+"""Marks in an MP4 or MOV file by which players and headsets recognise 3-D, panoramas and their cameras.
+
+`st3d` and `sv3d` follow Google's Spherical Video V2 RFC, `vexu` and `hfov` Apple's "QuickTime and ISO Base
+Media File Formats and Spatial and Immersive Media". PyAV cannot set them, so they are inserted in the sample
+descriptions (ISO/IEC 14496-12) of a finished file.
+"""
+
+import os
+import shutil
+import struct
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+from stereoweave.errors import FormatError, StereoweaveError
+from stereoweave.io.files import replacing
+
+# stereo_mode of `st3d`, without and with the right view first; None where the RFC has no number. Then the
+# packing kind of `pkin`.
+_PACKINGS: dict[str | None, tuple[int, int | None, bytes]] = {
+    None: (0, 0, b""),
+    "side_by_side": (2, 4, b"side"),
+    "top_bottom": (1, None, b"over"),
+}
+_PROJECTIONS = {
+    "rectilinear": b"rect",
+    "equirectangular": b"equi",
+    "half_equirectangular": b"hequ",
+    "fisheye": b"fish",
+}
+# Horizontal and vertical angle of a whole picture, in degrees.
+_COVERED_DEG = {"equirectangular": (360.0, 180.0), "half_equirectangular": (180.0, 180.0)}
+_MOST_BASELINE_M, _MOST_DEG = 1000.0, 360.0
+
+_SOURCE = b"Stereoweave\0"
+_HAS_LEFT, _HAS_RIGHT, _RIGHT_FIRST = 1, 2, 8
+_LEFT_IS_HERO = 1
+
+_MARKS = frozenset({b"st3d", b"sv3d", b"vexu", b"hfov"})
+# Boxes of a sample description that the RFC wants after `st3d` and `sv3d`.
+_OPTIONAL = frozenset({b"clap", b"pasp", b"colr", b"fiel", b"btrt", b"chrm", b"gama", b"clli", b"mdcv"})
+# Bytes of a visual sample description, and of `stsd`, before their boxes.
+_ENTRY_BYTES, _STSD_BYTES = 78, 8
+_TABLE = b"mdia", b"minf", b"stbl"
+# Boxes on the top level that state no place in the file.
+_PLACELESS = frozenset({b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot", b"uuid", b"udta"})
+# Boxes within the index that do: of encrypted samples, and of items such as pictures.
+_PLACES_IN_INDEX = b"saio", b"iloc"
+# The index of ten hours at 60 frames a second with sound has about 60 MB.
+_MOST_INDEX_BYTES = 500_000_000
+_MOST_BOXES = 100_000  # on the top level of a file
+
+
+@dataclass(frozen=True, kw_only=True)
+class VideoMarks:
+    """What a video file says about its views and cameras.
+
+    Attributes:
+        packing: How a frame holds both views: side_by_side, also at half width, or top_bottom, also at half
+            height; None for a single view.
+        right_first: Whether the right view is on the left, or on top.
+        projection: rectilinear, equirectangular, half_equirectangular (VR180) or fisheye.
+        field_of_view_deg: Horizontal angle of one view; None if unknown, or the whole 360 or 180 degrees of
+            an equirectangular picture.
+        vertical_field_of_view_deg: Vertical angle of an equirectangular view; None for 180 degrees.
+        baseline_m: Distance of the cameras; None if unknown.
+        adjustment_percent: Shift of the views against each other that players apply, in percent of the width.
+    """
+
+    packing: str | None = None
+    right_first: bool = False
+    projection: str = "rectilinear"
+    field_of_view_deg: float | None = None
+    vertical_field_of_view_deg: float | None = None
+    baseline_m: float | None = None
+    adjustment_percent: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, value, known in (
+            ("packing", self.packing, _PACKINGS),
+            ("projection", self.projection, _PROJECTIONS),
+        ):
+            if value not in known:
+                raise StereoweaveError(
+                    f"expected one of {', '.join(map(str, known))}, found {value!r}", setting=name
+                )
+        whole_deg = _COVERED_DEG.get(self.projection, (_MOST_DEG, 0.0))
+        for name, number, most in (
+            ("field_of_view_deg", self.field_of_view_deg, whole_deg[0]),
+            ("vertical_field_of_view_deg", self.vertical_field_of_view_deg, whole_deg[1]),
+            ("baseline_m", self.baseline_m, _MOST_BASELINE_M),
+        ):
+            if number is not None and not 0 < number <= most:
+                raise StereoweaveError(
+                    f"expected a number above 0 and at most {most:g}, found {number}", setting=name
+                )
+        if not abs(self.adjustment_percent) <= 100:
+            raise StereoweaveError(
+                f"expected -100 to 100 percent, found {self.adjustment_percent}", setting="adjustment_percent"
+            )
+
+    @property
+    def is_panorama(self) -> bool:
+        """Whether the views cover a sphere, or a part of it, equirectangularly."""
+        return self.projection in _COVERED_DEG
+
+
+class _Box(NamedTuple):
+    """A box: its type, its content, and all of its bytes. The type is empty for bytes that are no box."""
+
+    kind: bytes
+    content: bytes
+    whole: bytes
+
+
+class _Place(NamedTuple):
+    """Where a box of the top level starts and ends in its file."""
+
+    kind: bytes
+    start: int
+    end: int
+
+
+def write_marks(path: Path, marks: VideoMarks) -> None:
+    """Write the marks into the first video track of a finished MP4 or MOV file; earlier marks are replaced.
+
+    Pictures, sound and times stay as they are. A file with its index at the end is changed in place, so
+    that nobody else should read it yet.
+
+    Raises:
+        FormatError: The file is damaged, has no index, no video track or several of them, or consists of
+            fragments.
+    """
+    try:
+        with path.open("r+b") as file:
+            places = list(_find_places(file))
+            index = _find_index(places)
+            file.seek(index.start)
+            old = file.read(index.end - index.start)
+            if index is places[-1]:
+                new = mark_index(old, marks)
+                file.seek(index.start)
+                file.write(new)
+                file.truncate()
+                return
+            _check_movable(places, old)
+            new = mark_index(old, marks, moved_from=index.end)
+        _replace_index(path, index, new)
+    except FormatError as error:
+        raise error.with_prefix(f"{path}: ") from error
+    except OSError as error:
+        raise StereoweaveError(
+            f"{path}: expected a file that can be changed, found {error.strerror}"
+        ) from error
+
+
+def show_bounds(marks: VideoMarks) -> VideoMarks:
+    """Return the marks of a panorama with the bounds of its picture in place of Apple's name for them.
+
+    FFmpeg writes a projection to Matroska only with bounds.
+    """
+    width_deg, height_deg = _find_covered_deg(marks)
+    return replace(
+        marks,
+        projection="equirectangular",
+        field_of_view_deg=width_deg,
+        vertical_field_of_view_deg=height_deg,
+    )
+
+
+def mark_index(index: bytes, marks: VideoMarks, *, moved_from: int | None = None) -> bytes:
+    """Return the box `moov` with the marks in its video track.
+
+    Args:
+        index: The whole box.
+        marks: What to mark; marks that are there already are replaced.
+        moved_from: Place in the file from which on all media data moves by as much as the box grows. None if
+            the box is the last one.
+
+    Raises:
+        FormatError: The box is damaged, or has no video track or several.
+    """
+    if index[:4] == bytes(4):  # up to the end of the file
+        index = struct.pack(">I", len(index)) + index[4:]
+    [moov, *rest] = _split_boxes(index) or [_Box(b"", b"", b"")]
+    if moov.kind != b"moov" or rest:
+        raise FormatError("expected an index (moov), found a damaged one; write the file again")
+    count = sum(_is_video(box.content) for box in _split_boxes(moov.content) if box.kind == b"trak")
+    if count != 1:
+        raise FormatError(
+            f"expected an index with one video track, found {count or 'none'}; "
+            "write the file again with one video track"
+        )
+    boxes = make_boxes(marks)
+    new = make_box(b"moov", _change(moov.content, (b"trak",), lambda track: _mark_track(track, boxes)))
+    if moved_from is None:
+        return new
+    grown = len(new) - len(index)
+    for kind, number in ((b"stco", "I"), (b"co64", "Q")):
+        move = partial(_move_chunks, number=number, moved_from=moved_from, by=grown)
+        new = _change(new, (b"moov", b"trak", *_TABLE, kind), move)
+    return new
+
+
+def make_boxes(marks: VideoMarks) -> tuple[bytes, bytes]:
+    """Return the boxes for a sample description: `st3d` and `sv3d`, and `vexu` and `hfov`."""
+    mode, swapped_mode, packing = _PACKINGS[marks.packing]
+    google = b""
+    stereo_mode = swapped_mode if marks.right_first else mode
+    if stereo_mode is not None and (marks.packing or marks.is_panorama):
+        google += _make_full_box(b"st3d", bytes([stereo_mode]))
+    if marks.is_panorama:
+        google += _make_sv3d(marks)
+    parts = []
+    # A part of a sphere is neither the whole nor the half one that Apple's names mean.
+    is_part = marks.is_panorama and _find_covered_deg(marks) != _COVERED_DEG[marks.projection]
+    if marks.projection != "rectilinear" and not is_part:
+        kind = _make_full_box(b"prji", _PROJECTIONS[marks.projection])
+        parts.append(make_box(b"proj", kind))
+    if marks.packing:
+        parts.append(_make_eyes(marks))
+        parts.append(make_box(b"pack", _make_full_box(b"pkin", packing)))
+    apple = make_box(b"vexu", b"".join(parts)) if parts else b""
+    degrees = marks.field_of_view_deg or _COVERED_DEG.get(marks.projection, (0.0, 0.0))[0]
+    if degrees:
+        apple += make_box(b"hfov", struct.pack(">I", round(1000 * degrees)))
+    return google, apple
+
+
+def make_box(kind: bytes, content: bytes) -> bytes:
+    """Return a box of this type."""
+    if len(content) + 8 < 1 << 32:
+        return struct.pack(">I4s", len(content) + 8, kind) + content
+    return struct.pack(">I4sQ", 1, kind, len(content) + 16) + content
+
+
+def _make_full_box(kind: bytes, content: bytes) -> bytes:
+    """Return a box of version 0, without flags."""
+    return make_box(kind, bytes(4) + content)
+
+
+def _make_eyes(marks: VideoMarks) -> bytes:
+    views = _HAS_LEFT | _HAS_RIGHT | (_RIGHT_FIRST if marks.right_first else 0)
+    parts = _make_full_box(b"stri", bytes([views])) + _make_full_box(b"hero", bytes([_LEFT_IS_HERO]))
+    if marks.baseline_m:
+        parts += make_box(b"cams", _make_full_box(b"blin", struct.pack(">I", round(1e6 * marks.baseline_m))))
+    if marks.adjustment_percent:
+        adjustment = struct.pack(">i", round(100 * marks.adjustment_percent))
+        parts += make_box(b"cmfy", _make_full_box(b"dadj", adjustment))
+    return make_box(b"eyes", parts)
+
+
+def _find_covered_deg(marks: VideoMarks) -> tuple[float, float]:
+    """Return the angles of an equirectangular view."""
+    width_deg, height_deg = _COVERED_DEG[marks.projection]
+    return marks.field_of_view_deg or width_deg, marks.vertical_field_of_view_deg or height_deg
+
+
+def _make_sv3d(marks: VideoMarks) -> bytes:
+    width_deg, height_deg = _find_covered_deg(marks)
+    # What is missing at each side, as a share of the sphere in 0.32 bits.
+    across, down = (round((1 - share) / 2 * (1 << 32)) for share in (width_deg / 360, height_deg / 180))
+    bounds = _make_full_box(b"equi", struct.pack(">4I", down, down, across, across))
+    pose = _make_full_box(b"prhd", bytes(12))
+    return make_box(b"sv3d", _make_full_box(b"svhd", _SOURCE) + make_box(b"proj", pose + bounds))
+
+
+def _mark_track(track: bytes, boxes: tuple[bytes, bytes]) -> bytes:
+    if not _is_video(track):
+        return track
+    return _change(track, (*_TABLE, b"stsd"), lambda table: _mark_descriptions(table, boxes), needed=True)
+
+
+def _mark_descriptions(table: bytes, boxes: tuple[bytes, bytes]) -> bytes:
+    """Return the content of `stsd` with boxes in each sample description."""
+    entries = [box for box in _split_boxes(table[_STSD_BYTES:]) if box.kind]
+    if not entries or len(entries) != int.from_bytes(table[4:_STSD_BYTES]):
+        raise FormatError(
+            "expected a sample description in the index, found a damaged one; write the file again"
+        )
+    return table[:_STSD_BYTES] + b"".join(
+        make_box(box.kind, _mark_entry(box.content, boxes)) for box in entries
+    )
+
+
+def _mark_entry(entry: bytes, boxes: tuple[bytes, bytes]) -> bytes:
+    if len(entry) < _ENTRY_BYTES:
+        raise FormatError("expected a sample description of video, found one cut off; write the file again")
+    google, apple = boxes
+    kept = [box for box in _split_boxes(entry[_ENTRY_BYTES:]) if box.kind not in _MARKS]
+    # QuickTime may end the description with four zeros, which are no box.
+    first = next((at for at, box in enumerate(kept) if box.kind in _OPTIONAL or not box.kind), len(kept))
+    last = len(kept) - 1 if kept and not kept[-1].kind else len(kept)
+    parts = [box.whole for box in kept]
+    return entry[:_ENTRY_BYTES] + b"".join([*parts[:first], google, *parts[first:last], apple, *parts[last:]])
+
+
+def _is_video(track: bytes) -> bool:
+    media = [box.content for box in _split_boxes(track) if box.kind == b"mdia"]
+    return any(
+        box.kind == b"hdlr" and box.content[8:12] == b"vide" for boxes in media for box in _split_boxes(boxes)
+    )
+
+
+def _move_chunks(table: bytes, number: str, moved_from: int, by: int) -> bytes:
+    """Return the content of `stco` or `co64` after the chunks from a place on moved."""
+    count, size = int.from_bytes(table[4:8]), struct.calcsize(number)
+    if len(table) < 8 + count * size:
+        raise FormatError("expected a table of chunks in the index, found one cut off; write the file again")
+    places = struct.unpack_from(f">{count}{number}", table, 8)
+    moved = [place + by if place >= moved_from else place for place in places]
+    if moved and max(moved) >= 1 << 8 * size:
+        raise FormatError("expected a file below 4 GB, or with its index at the end; write the file again")
+    return table[:8] + struct.pack(f">{count}{number}", *moved) + table[8 + count * size :]
+
+
+def _change(
+    boxes: bytes, way: Sequence[bytes], change: Callable[[bytes], bytes], *, needed: bool = False
+) -> bytes:
+    """Return boxes after a change of the content of each box at the end of the way through their types.
+
+    Raises:
+        FormatError: A box is damaged; or `needed` is true and there is none on the way.
+    """
+    kind, *rest = way
+    found = _split_boxes(boxes)
+    if needed and not any(box.kind == kind for box in found):
+        raise FormatError(f"expected the box {kind.decode()} in the index, found none; write the file again")
+    return b"".join(
+        make_box(kind, _change(box.content, rest, change, needed=needed) if rest else change(box.content))
+        if box.kind == kind
+        else box.whole
+        for box in found
+    )
+
+
+def _split_boxes(content: bytes) -> list[_Box]:
+    """Return the boxes that follow one another. A rest, shorter than a box, is the last one, without a type.
+
+    Raises:
+        FormatError: A box is longer than what holds it.
+    """
+    found, start = [], 0
+    while len(content) - start >= 8:
+        size, kind = struct.unpack_from(">I4s", content, start)
+        head = 16 if size == 1 else 8
+        if size == 1:
+            size = int.from_bytes(content[start + 8 : start + 16])
+        end = start + size
+        if size < head or end > len(content):
+            raise FormatError(
+                f"expected boxes that fit into the index, found {kind!r} with {size} bytes at the place of "
+                f"{len(content) - start}; write the file again"
+            )
+        found.append(_Box(kind, content[start + head : end], content[start:end]))
+        start = end
+    return [*found, _Box(b"", b"", content[start:])] if start < len(content) else found
+
+
+def _find_places(file: BinaryIO) -> Iterator[_Place]:
+    """Yield the boxes on the top level of a file.
+
+    Raises:
+        FormatError: One of them is damaged or cut off, or there are very many.
+    """
+    total = os.fstat(file.fileno()).st_size
+    start = 0
+    for _ in range(_MOST_BOXES):
+        if start == total:
+            return
+        file.seek(start)
+        size, kind, long_size = struct.unpack(">I4sQ", file.read(16).ljust(16, b"\0"))
+        head = 16 if size == 1 else 8
+        # A size of 0 stands for the rest of the file.
+        size = {0: total - start, 1: long_size}.get(size, size)
+        if size < head or start + size > total:
+            raise FormatError(
+                f"expected whole boxes, found {kind!r} with {size} bytes of which the file holds "
+                f"{total - start}; record or write the file again"
+            )
+        yield _Place(kind, start, start + size)
+        start += size
+    raise FormatError(f"expected at most {_MOST_BOXES} boxes, found more; write the file again")
+
+
+def _find_index(places: Sequence[_Place]) -> _Place:
+    kinds = {place.kind for place in places}
+    if b"moof" in kinds:
+        raise FormatError(
+            "expected a file with one index, found fragments (moof); write it without fragments"
+        )
+    found = [place for place in places if place.kind == b"moov"]
+    if len(found) != 1:
+        raise FormatError(f"expected one index (moov), found {len(found) or 'none'}; write the file again")
+    size_bytes = found[0].end - found[0].start
+    if size_bytes > _MOST_INDEX_BYTES:
+        raise FormatError(
+            f"expected an index of at most {_MOST_INDEX_BYTES // 1_000_000} MB, found "
+            f"{size_bytes // 1_000_000} MB; write the file again"
+        )
+    return found[0]
+
+
+def _check_movable(places: Sequence[_Place], index: bytes) -> None:
+    """Raise FormatError if more than the tables of chunks names places, so that no data can be moved."""
+    others = [repr(kind) for kind in sorted({place.kind for place in places} - _PLACELESS)]
+    others += [repr(kind) for kind in _PLACES_IN_INDEX if kind in index]
+    if others:
+        raise FormatError(
+            f"expected an index that alone names places in the file, found {', '.join(others)}; "
+            "write the file again with its index at the end"
+        )
+
+
+def _replace_index(path: Path, index: _Place, new: bytes) -> None:
+    """Write the file again, with another index in its place."""
+    with replacing(path) as temporary, path.open("rb") as old, temporary.open("wb") as file:
+        _copy_bytes(old, file, index.start)
+        file.write(new)
+        old.seek(index.end)
+        shutil.copyfileobj(old, file)
+
+
+def _copy_bytes(source: BinaryIO, target: BinaryIO, count: int) -> None:
+    while count and (block := source.read(min(count, 1 << 20))):
+        target.write(block)
+        count -= len(block)
