@@ -76,6 +76,11 @@ class Window:
         """Return the camera of both images; None if they are no perspective images."""
         return None
 
+    @property
+    def repeats_px(self) -> tuple[float, ...]:
+        """Shifts of columns at which the window may show the same direction again."""
+        return (0.0,)
+
     def _to_pixels(self, across: Map, down: Map) -> tuple[Map, Map]:
         columns, rows = across * self.focal_px + self.cx_px, down * self.focal_px + self.cy_px
         return columns.astype(np.float32), rows.astype(np.float32)
@@ -187,6 +192,12 @@ class StripWindow(_Turning):
         """Return the columns and rows of the pixels that show the rays; of two, those nearer the middle."""
         x, y, z = rays
         return self._to_pixels(np.arctan2(x, z), np.arctan2(y, np.hypot(x, z)))
+
+    @property
+    def repeats_px(self) -> tuple[float, ...]:
+        """Shifts of columns at which the window may show the same direction again."""
+        circle_px = 2 * math.pi * self.focal_px
+        return (0.0, -circle_px, circle_px)
 
     def nearness(self, disparity_px: Map) -> Map:
         """Return the left eye's 1 / distance, in 1 / baselines."""

@@ -4,8 +4,19 @@ import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from stereoweave.cameras.sphere_remap import Cutter
-from stereoweave.cameras.sphere_windows import CylinderWindow, Window, make_whole_window, make_window
+import numpy as np
+from jaxtyping import Shaped
+
+from stereoweave.cameras.sphere_remap import Cutter, Spreader
+from stereoweave.cameras.sphere_windows import (
+    ArcWindow,
+    CylinderWindow,
+    PerspectiveWindow,
+    StripWindow,
+    Window,
+    make_whole_window,
+    make_window,
+)
 from stereoweave.cameras.spherical import (
     EQUIRECTANGULAR,
     HALF,
@@ -13,7 +24,7 @@ from stereoweave.cameras.spherical import (
     SphereRequest,
     describe_projection,
 )
-from stereoweave.errors import FormatError, Note, Remedy
+from stereoweave.errors import FormatError, Note, Remedy, StereoweaveError
 from stereoweave.io import vr180
 from stereoweave.io.decoding import DecodedPicture, decode_embedded
 from stereoweave.stereo import StereoPair
@@ -53,6 +64,31 @@ class SphereView(NamedTuple):
     def cutter(self) -> Cutter:
         """Return the cutter of both eyes' images."""
         return Cutter(self.projection, self.eye_size_px, self.window)
+
+    @property
+    def is_flat(self) -> bool:
+        """Whether the window is a perspective image."""
+        return isinstance(self.window, PerspectiveWindow)
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether the window shows all directions."""
+        return isinstance(self.window, ArcWindow | StripWindow)
+
+    @property
+    def whole_projection(self) -> Projection:
+        """Projection of results for the whole field of view."""
+        return Projection.named(EQUIRECTANGULAR if self.projection.turns else HALF)
+
+    @property
+    def whole_size_px(self) -> tuple[int, int]:
+        """Width and height of results for the whole field of view."""
+        height_px = self.window.size_px[1]
+        return (2 * height_px if self.projection.turns else height_px), height_px
+
+    def spreader(self) -> Spreader:
+        """Return the spreader of the window's images over results for the whole field of view."""
+        return Spreader(self.window, self.whole_projection, self.whole_size_px)
 
     def note(self, request: SphereRequest, why: str) -> Note:
         """Return a note on what is shown."""
@@ -122,3 +158,34 @@ def find_by_aspect(path: Path, eye_size_px: tuple[int, int]) -> Projection:
         f"found {eye_size_px[0]}x{eye_size_px[1]} px without them",
         remedy=Remedy("choose its projection", ("projection",)),
     )
+
+
+# Layouts whose views are equirectangular again, each with its columns and rows of views.
+WHOLE_LAYOUTS = {
+    "side_by_side": (2, 1),
+    "crossed": (2, 1),
+    "top_bottom": (1, 2),
+    "anaglyph_grey": (1, 1),
+    "anaglyph_colour": (1, 1),
+    "anaglyph_half_colour": (1, 1),
+    "anaglyph_dubois": (1, 1),
+}
+
+
+def check_whole_layout(name: str | None) -> None:
+    """Raise a StereoweaveError for a layout that cannot show the whole field of view; None is one view."""
+    if name not in (None, *WHOLE_LAYOUTS):
+        raise StereoweaveError(
+            f"expected one of {', '.join(WHOLE_LAYOUTS)} for the whole field of view, found {name}",
+            setting="layout",
+        )
+
+
+def spread_views(
+    spreader: Spreader, image: Shaped[np.ndarray, "h w *c"], layout: str | None
+) -> Shaped[np.ndarray, "h2 w2 *c"]:
+    """Return a layout's image with each view spread over an equirectangular image."""
+    columns, rows = WHOLE_LAYOUTS.get(layout or "", (1, 1))
+    bands = [np.split(band, columns, axis=1) for band in np.split(image, rows, axis=0)]
+    spread = [[spreader.spread(np.ascontiguousarray(part)) for part in parts] for parts in bands]
+    return np.vstack([np.hstack(parts) for parts in spread])

@@ -12,6 +12,7 @@ from stereoweave.matching.backend import Backend
 from stereoweave.rendering.layouts import LAYOUTS, LayoutOptions, check_positions
 from stereoweave.rendering.renderer import Renderer
 from stereoweave.stereo import Estimate, StereoCamera, StereoPair
+from stereoweave.video.sphere_output import WholeOutput
 from stereoweave.video.survey import Survey
 from stereoweave.video.writer import Picture
 
@@ -36,6 +37,7 @@ class VideoJob:
         convergence_px: Disparity of the points that stay in the same column in all views. Default: the median
             disparity of the scene for layouts that overlay their views, 0 for all others.
         rectify: Whether to rectify the shots whose rows are apart, and to swap the sides if they are swapped.
+        whole: Output for the whole field of view of a VR180 or 360-degree video; None for a window.
         backend: Backend that matches the frames.
         name_of: Function that returns the front end's name for a setting, used in notes.
     """
@@ -47,6 +49,7 @@ class VideoJob:
     strength: float = 1.0
     convergence_px: float | None = None
     rectify: bool = True
+    whole: WholeOutput | None = None
     backend: Backend = Backend()
     name_of: NameOf = keyword
 
@@ -91,6 +94,12 @@ class VideoJob:
 
     def render_frame(self, pair: StereoPair, estimate: Estimate, survey: Survey) -> Picture:
         """Render the output image of one frame."""
+        if self.whole is None:
+            return self._render_pair(pair, estimate, survey)
+        seen = self.whole.measure_nearness(estimate) if self.depth else estimate
+        return self.whole.spread(self._render_pair(pair, seen, survey))
+
+    def _render_pair(self, pair: StereoPair, estimate: Estimate, survey: Survey) -> Picture:
         if self.depth:
             return colour_disparity(estimate.disparity_px, survey.range_px)
         if self.depth16:

@@ -20,6 +20,7 @@ from stereoweave.io.images import read_image
 from stereoweave.stereo import StereoCamera
 from stereoweave.video.colours import convert_to_rgb, name_hdr
 from stereoweave.video.spatial import Stereo3D, ViewPair, is_spatial, pair_views, read_stereo3d
+from stereoweave.video.sphere_marks import SphereMark, read_sphere
 
 if TYPE_CHECKING:
     import av
@@ -76,6 +77,7 @@ class VideoTrack:
             an unsupported packing; None if the file declares no packing, or is a spatial video.
         is_spatial: Whether the video is a spatial one (MV-HEVC), with each view in a layer of its own.
         camera: Camera of the views of a spatial video, if the file declares it and rotates no views.
+        sphere: Projection of a VR180 or 360-degree video, if the file declares one.
         notes: Notes on views and colours.
         sound: Path of the file if it has sound, else None.
         truncation: Message about a file that ends early; None for a complete file.
@@ -108,6 +110,7 @@ class VideoTrack:
         has_camera = self.is_spatial and first.rotation % 360 == 0
         self.camera = declared.camera(self._frame_size_px) if has_camera else None
         self._packed = declared if first.rotation % 360 == 0 and not self.is_spatial else Stereo3D()
+        self.sphere = read_sphere(self.name, first)
         self.notes = [declared.note()] if self.is_spatial else []
         if hdr := name_hdr(first):
             self.notes.append(Note(f"the video is HDR ({hdr}); it is tone-mapped to SDR (BT.709)"))
@@ -226,6 +229,7 @@ class PictureTrack:
     declared_packing: str | None = None
     is_spatial = False
     camera: StereoCamera | None = None
+    sphere: SphereMark | None = None
     notes: Sequence[Note] = ()
     retimed: Collection[int] = ()
     sound: Path | None = None
