@@ -21,6 +21,8 @@ PACKAGE = Path(sw.__file__).parent
 TESTS = Path(__file__).parent
 # Settings that no constant names, by module and expression.
 VARIABLE: dict[tuple[str, str], set[str]] = {
+    ("cameras/spherical.py", "given[0]"): {"whole", "look_deg", "fov_deg", "lens_fov_deg"},
+    ("cameras/spherical.py", "setting"): {"look_deg", "fov_deg"},
     ("app/pair_form.py", "setting"): {"focal_px", "baseline_m"},
     ("errors.py", "error.setting"): set(),  # of an error that another one takes the place of
     ("pictures/pair_finding.py", "side"): {"left", "right"},
@@ -38,11 +40,13 @@ ABSENT = {
         *("align", "board", "convergence_px", "files", "forward", "layout", "left"),
         *("listed", "out", "provider", "quilt", "range_px", "raw", "refined"),
         *("right", "strength", "up"),
+        *("projection", "look_deg", "fov_deg", "lens_fov_deg", "whole"),
     },
     "service": {
         *("align", "board", "convergence_px", "crop", "files", "forward", "layout", "left"),
         *("listed", "no_rectify", "out", "provider", "quilt", "raw"),
         *("right", "up"),
+        *("projection", "look_deg", "fov_deg", "lens_fov_deg", "whole"),
     },
 }
 

@@ -17,21 +17,29 @@ from stereoweave.cli.options import (
     Calib,
     FocalPx,
     Format,
+    Fov,
+    LensFov,
+    Look,
     Model,
     Pictures,
+    Projection,
     Provider,
     Range,
     Raw,
     Rectify,
     Refined,
     Threads,
+    Whole,
     make_request,
+    make_sphere_request,
     parse_pixel,
     parse_range_px,
 )
+from stereoweave.errors import StereoweaveError
 
 if TYPE_CHECKING:
     from stereoweave.outputs.report import Summary
+    from stereoweave.outputs.results import DepthJob
 
 Write = Annotated[
     list[str] | None,
@@ -97,6 +105,11 @@ def depth(  # noqa: PLR0913 - each is an option of the command line
     focal_px: FocalPx = None,
     baseline_m: BaselineM = None,
     rectify: Rectify = None,
+    projection: Projection = None,
+    look: Look = None,
+    fov: Fov = None,
+    lens_fov: LensFov = None,
+    whole: Whole = False,
     range_px: Range = None,
     write: Write = None,
     refined: Refined = False,
@@ -113,7 +126,14 @@ def depth(  # noqa: PLR0913 - each is an option of the command line
     from stereoweave.pictures.pair_finding import find_pairs
 
     job = DepthJob(
-        request=make_request(format, calib, focal_px, baseline_m, rectify),
+        request=make_request(
+            format,
+            calib,
+            focal_px,
+            baseline_m,
+            rectify,
+            make_sphere_request(projection, look, fov, lens_fov, whole),
+        ),
         backend=Backend(model=model, threads=threads, provider=provider),
         options=MatchOptions(range_px=parse_range_px(range_px), refined=refined, raw=raw),
         files=tuple(write or ()),
@@ -123,6 +143,9 @@ def depth(  # noqa: PLR0913 - each is an option of the command line
     pictures = pictures or []
     found = find_pairs(pictures, left, right, listed)
     out = out or _name_results(pictures, left, listed)
+    if whole:
+        _write_whole(pictures, out, job, many=bool(found), as_json=as_json)
+        return
     if found:
         from stereoweave.batch.local import run_batch_command
 
@@ -130,6 +153,27 @@ def depth(  # noqa: PLR0913 - each is an option of the command line
     summary, notes = make_depth(pictures, out, job)
     lines = [note.format(job.name_of) for note in notes]
     (_print_json if as_json else _print_summary)(summary, lines, out)
+
+
+def _write_whole(pictures: Sequence[Path], out: Path, job: "DepthJob", *, many: bool, as_json: bool) -> None:
+    """Write the distances over the whole field of view of one pair, and print a summary."""
+    from stereoweave.outputs.sphere_depth import FILES, LEFT, make_sphere_depth
+
+    if many:
+        raise StereoweaveError("--whole: expected one pair, found several; process them one by one")
+    facts, notes = make_sphere_depth(pictures, out, job)
+    lines = [note.format(job.name_of) for note in notes]
+    files = {file: str(out / file) for file in (*FILES, LEFT)}
+    if as_json:
+        typer.echo(json.dumps(asdict(facts) | {"notes": lines, "files": files}, indent=2, allow_nan=False))
+        return
+    near, far = (
+        "infinity" if value is None else f"{value:.3g} {facts.unit}"
+        for value in (facts.distance_p1, facts.distance_p99)
+    )
+    typer.echo(f"{' + '.join(facts.pictures)}: {facts.projection}, {facts.width_px}x{facts.height_px} px")
+    typer.echo(f"distance {near} to {far} (the middle 98 % of the pixels)")
+    typer.echo("\n".join([*lines, f"files: {', '.join(files)}"]))
 
 
 def _name_results(pictures: Sequence[Path], left: str | None, listed: Path | None) -> Path:
@@ -160,6 +204,10 @@ def measure(  # noqa: PLR0913 - each is an option of the command line
     focal_error_percent: FocalError = 0.0,
     baseline_error_percent: BaselineError = 0.0,
     rectify: RectifyFirst = False,
+    projection: Projection = None,
+    look: Look = None,
+    fov: Fov = None,
+    lens_fov: LensFov = None,
     range_px: Range = None,
     refined: Refined = False,
     model: Model = "base",
@@ -181,7 +229,8 @@ def measure(  # noqa: PLR0913 - each is an option of the command line
 
     places = parse_pixel("--from", first), parse_pixel("--to", second)
     options = MatchOptions(range_px=parse_range_px(range_px), refined=refined)
-    prepared = prepare(pictures, make_request(format, calib, focal_px, baseline_m, rectify))
+    sphere = make_sphere_request(projection, look, fov, lens_fov)
+    prepared = prepare(pictures, make_request(format, calib, focal_px, baseline_m, rectify, sphere))
     camera = require_camera(prepared.pair)
     height, width = prepared.pair.left.shape[:2]
     check_places((width, height), *places)

@@ -15,6 +15,7 @@ import typer
 from stereoweave.errors import StereoweaveError, reason, require_extra
 
 if TYPE_CHECKING:
+    from stereoweave.cameras.spherical import SphereRequest
     from stereoweave.pictures.prepare import Request
     from stereoweave.system.ray_engine import Engine
 
@@ -34,6 +35,40 @@ Format = Annotated[
         help="Layout of a picture that holds both views: side_by_side, side_by_side_half, crossed, "
         "crossed_half, top_bottom, top_bottom_half, top_bottom_right_first, top_bottom_right_first_half, "
         "mpo or jps (default: detected).",
+    ),
+]
+Projection = Annotated[
+    str | None,
+    typer.Option(
+        help="Projection of VR180 and 360-degree files: equirectangular (360 degrees), half_equirectangular "
+        "(VR180), fisheye, or rectilinear for ordinary ones (default: from the file's metadata or its name)."
+    ),
+]
+Look = Annotated[
+    str | None,
+    typer.Option(
+        metavar="YAW,PITCH",
+        help="Direction of the window that is cut from a VR180 or 360-degree file, in degrees to the right "
+        "and upwards (default: 0,0, straight ahead).",
+    ),
+]
+Fov = Annotated[
+    float | None,
+    typer.Option(metavar="DEGREES", help="Field of view of that window, from 10 to 150 (default: 90)."),
+]
+LensFov = Annotated[
+    float | None,
+    typer.Option(
+        metavar="DEGREES",
+        help="Field of view of a fisheye lens, such as 190 (default: from the file, or 180).",
+    ),
+]
+Whole = Annotated[
+    bool,
+    typer.Option(
+        "--whole",
+        help="Process the whole field of view of a VR180 or 360-degree file, instead of a window; the result "
+        "is equirectangular again.",
     ),
 ]
 OldFormat = Annotated[str | None, typer.Option("--arrangement", hidden=True, help="Old name of --format.")]
@@ -138,14 +173,36 @@ def replace_old_option(old: tuple[str, str | None], new: tuple[str, str | None])
     return old_value
 
 
-def make_request(
+def make_sphere_request(
+    projection: str | None = None,
+    look: str | None = None,
+    fov: float | None = None,
+    lens_fov: float | None = None,
+    whole: bool = False,
+) -> "SphereRequest":
+    """Return the `SphereRequest` that the options of a command line describe."""
+    from stereoweave.cameras.spherical import SphereRequest
+
+    expected = "yaw and pitch in degrees, such as 30,-10"
+    return SphereRequest(
+        projection=projection,
+        look_deg=None if look is None else _parse_two_numbers("--look", look, expected),
+        fov_deg=fov,
+        lens_fov_deg=lens_fov,
+        whole=whole,
+    )
+
+
+def make_request(  # noqa: PLR0913 - each is an option of the command line
     format: str | None = None,
     calib: Path | None = None,
     focal_px: float | None = None,
     baseline_m: float | None = None,
     rectify: bool | None = None,
+    sphere: "SphereRequest | None" = None,
 ) -> "Request":
     """Return the `Request` that the options of a command line describe."""
+    from stereoweave.cameras.spherical import SphereRequest
     from stereoweave.pictures.prepare import Request
 
     return Request(
@@ -154,6 +211,7 @@ def make_request(
         focal_px=focal_px,
         baseline_m=baseline_m,
         rectify=rectify,
+        sphere=sphere or SphereRequest(),
     )
 
 

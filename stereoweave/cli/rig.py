@@ -11,13 +11,32 @@ from typing import Annotated
 import typer
 
 from stereoweave.cli.commands import running_options, shows_steps
-from stereoweave.cli.options import AsJson, Calib, Format, Pictures, make_parent_folder
+from stereoweave.cli.options import (
+    AsJson,
+    Calib,
+    Format,
+    Fov,
+    LensFov,
+    Look,
+    Pictures,
+    Projection,
+    make_parent_folder,
+    make_sphere_request,
+)
 from stereoweave.errors import Note, StereoweaveError
 from stereoweave.system.steps import step
 
 
 @shows_steps
-def check(pictures: Pictures, format: Format = None, as_json: AsJson = False) -> None:
+def check(  # noqa: PLR0913 - each is an option of the command line
+    pictures: Pictures,
+    format: Format = None,
+    projection: Projection = None,
+    look: Look = None,
+    fov: Fov = None,
+    lens_fov: LensFov = None,
+    as_json: AsJson = False,
+) -> None:
     """Check a pair for problems, and report each with its remedy.
 
     The checks cover rectification, swapped pictures, disparity range and exposure. The exit status is 1 if
@@ -26,7 +45,7 @@ def check(pictures: Pictures, format: Format = None, as_json: AsJson = False) ->
     from stereoweave.cameras.alignment import check_pair
     from stereoweave.pictures.loading import open_pictures
 
-    opened = open_pictures(pictures, format)
+    opened = open_pictures(pictures, format, make_sphere_request(projection, look, fov, lens_fov))
     with step("checking the pair"):
         found = check_pair(opened.pair.left, opened.pair.right)
     lines = _advise_once(found.lines())
@@ -59,7 +78,7 @@ def _replace_nan(value: object) -> object:
 
 
 @shows_steps
-def rectify(
+def rectify(  # noqa: PLR0913 - each is an option of the command line
     pictures: Pictures,
     out: Annotated[
         Path | None,
@@ -72,6 +91,10 @@ def rectify(
     ] = None,
     format: Format = None,
     calib: Calib = None,
+    projection: Projection = None,
+    look: Look = None,
+    fov: Fov = None,
+    lens_fov: LensFov = None,
 ) -> None:
     """Rectify a pair by its calibration or by matched features.
 
@@ -89,7 +112,8 @@ def rectify(
     out = out or Path(f"{pictures[0].stem}_rectified")
     _check_output(pictures, calib, out)
     make_parent_folder(out / "left.png", out / "right.png", out / "calib.yml")
-    prepared = prepare(pictures, Request(format=format, calibration=calib, rectify=True))
+    sphere = make_sphere_request(projection, look, fov, lens_fov)
+    prepared = prepare(pictures, Request(format=format, calibration=calib, rectify=True, sphere=sphere))
     pair = crop(prepared.pair)
     with lock_output(make_folder(out)):
         write_image(out / "left.png", pair.left)

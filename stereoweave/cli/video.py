@@ -8,11 +8,17 @@ import typer
 
 from stereoweave.cli.commands import running_options, shows_steps
 from stereoweave.cli.options import (
+    Fov,
+    LensFov,
+    Look,
     OldFormat,
+    Projection,
     Provider,
     Strength,
     Threads,
+    Whole,
     make_parent_folder,
+    make_sphere_request,
     replace_old_option,
 )
 from stereoweave.errors import StereoweaveError
@@ -141,6 +147,11 @@ def video(  # noqa: PLR0913 - each is an option of the command line
     format: Format = None,
     rate: Rate = None,
     rectify: RectifyShots = True,
+    projection: Projection = None,
+    look: Look = None,
+    fov: Fov = None,
+    lens_fov: LensFov = None,
+    whole: Whole = False,
     preview: Preview = None,
     model: VideoModel = "small",
     threads: Threads = None,
@@ -176,7 +187,12 @@ def video(  # noqa: PLR0913 - each is an option of the command line
             name_of=running_options(),
         )
         length_s = None if preview is None else _parse_length_s(preview)
-        source = open_video(videos, format, rate=None if rate is None else _parse_rate(rate))
+        source = open_video(
+            videos,
+            format,
+            rate=None if rate is None else _parse_rate(rate),
+            sphere=make_sphere_request(projection, look, fov, lens_fov, whole),
+        )
         whole_count = source.frame_count
         if length_s is not None:
             source = _cut_from_middle(source, length_s)

@@ -11,15 +11,21 @@ import typer
 from stereoweave.cli.commands import running_options, shows_steps
 from stereoweave.cli.options import (
     Format,
+    Fov,
+    LensFov,
+    Look,
     Model,
     Pictures,
+    Projection,
     Provider,
     Range,
     Rectify,
     Strength,
     Threads,
+    Whole,
     make_parent_folder,
     make_request,
+    make_sphere_request,
     parse_largest_size_px,
     parse_range_px,
 )
@@ -113,6 +119,11 @@ def view(  # noqa: PLR0913 - each is an option of the command line
     format: Format = None,
     calib: Calib = None,
     rectify: Rectify = None,
+    projection: Projection = None,
+    look: Look = None,
+    fov: Fov = None,
+    lens_fov: LensFov = None,
+    whole: Whole = False,
     range_px: Range = None,
     model: Model = "base",
     threads: Threads = None,
@@ -124,6 +135,7 @@ def view(  # noqa: PLR0913 - each is an option of the command line
     from stereoweave.matching.backend import Backend
     from stereoweave.matching.estimate import match
     from stereoweave.matching.options import MatchOptions
+    from stereoweave.outputs.sphere_views import check_whole_view, write_whole_view
     from stereoweave.outputs.view_files import ViewFile
     from stereoweave.pictures.prepare import prepare
     from stereoweave.rendering.layouts import choose_layout, is_converged
@@ -147,13 +159,19 @@ def view(  # noqa: PLR0913 - each is an option of the command line
         threads=threads,
     )
     options = MatchOptions(range_px=parse_range_px(range_px), refined=True)
-    prepared = prepare(pictures, make_request(format, calib, rectify=rectify))
-    pair = crop_to_content(prepared.pair)
+    sphere = make_sphere_request(projection, look, fov, lens_fov, whole)
+    if whole:
+        check_whole_view(file)
+    prepared = prepare(pictures, make_request(format, calib, rectify=rectify, sphere=sphere))
+    pair = prepared.pair if whole else crop_to_content(prepared.pair)
     file = file.add_mark(pair)
     make_parent_folder(file.path)
     compile_ahead(*file.rehearsals)
     estimate = match(Backend(model=model, threads=threads, provider=provider).matcher(), pair, options)
-    written = file.write(pair, estimate, prepared.pictures)
+    if whole:
+        written = write_whole_view(file, prepared, estimate)
+    else:
+        written = file.write(pair, estimate, prepared.pictures)
     typer.echo(f"{file.path}: {written.description}")
     _print_notes([*prepared.notes, *find_problems(pair, estimate, prepared.alignment, prepared.remedy)])
 

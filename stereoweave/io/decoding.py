@@ -18,7 +18,7 @@ from jaxtyping import Shaped, UInt8
 from PIL import Image, UnidentifiedImageError, features
 
 from stereoweave.errors import FormatError, Remedy, reason
-from stereoweave.io import exif, heif
+from stereoweave.io import exif, heif, vr180
 from stereoweave.io.colour_profiles import make_profile
 from stereoweave.io.similar_names import as_typed, describe_missing
 from stereoweave.stereo import LONGEST_SIDE_PX
@@ -64,8 +64,12 @@ class DecodedPicture(NamedTuple):
 
 
 @contextmanager
-def open_picture(path: Path, *, views: int = 1, expected: str = A_PICTURE) -> Iterator[Image.Image]:
+def open_picture(
+    path: Path, *, views: int = 1, expected: str = A_PICTURE, panorama: bool = False
+) -> Iterator[Image.Image]:
     """Open a picture with up to `views` views and check its format and size, without decoding it.
+
+    Of one view, a VR180 picture or a panorama is accepted only if asked for (`panorama`).
 
     Raises:
         FormatError: The format or the size is unsupported. Damaged content is not detected before decoding.
@@ -81,13 +85,13 @@ def open_picture(path: Path, *, views: int = 1, expected: str = A_PICTURE) -> It
         # The sizes of all pictures: Pillow allocates memory when it seeks one.
         for size_px in (picture.size, *(heif.read_sizes(path) if is_heif else ())):
             check_size(path, size_px, views=views)
-        _refuse_by_content(path, picture, views)
+        _refuse_by_content(path, picture, views, panorama)
         yield picture
 
 
-def read_picture(path: Path) -> DecodedPicture:
-    """Decode a picture file that holds one view."""
-    with open_picture(path) as picture:
+def read_picture(path: Path, *, panorama: bool = False) -> DecodedPicture:
+    """Decode a picture file that holds one view, which may be a `panorama` if asked for."""
+    with open_picture(path, panorama=panorama) as picture:
         return decode(path, picture)
 
 
@@ -124,6 +128,14 @@ def decode_packed_values(name: str, content: bytes) -> Shaped[np.ndarray, "h w *
         picture = _open(name, io.BytesIO(content), 1)
     check_size(name, picture.size)
     return decode_values(name, picture)
+
+
+def decode_embedded(name: str, content: bytes) -> DecodedPicture:
+    """Decode a picture embedded in another file, with its colours; error messages call it `name`."""
+    with _decoding(name):
+        picture = _open(name, io.BytesIO(content), 1)
+    check_size(name, picture.size)
+    return decode(Path(name), picture)
 
 
 def check_regular(path: Path, expected: str) -> None:
@@ -229,14 +241,13 @@ def _refuse_by_name(path: Path, brands: set[bytes]) -> None:
         )
 
 
-def _refuse_by_content(path: Path, picture: Any, views: int) -> None:
-    """Raise a FormatError for a panorama, a VR180 picture or an animation of more frames than views."""
-    description = picture.info.get("xmp", b"")
-    words = description if isinstance(description, bytes) else str(description).encode(errors="replace")
-    if b"GImage:" in words or b"equirectangular" in words.lower():
+def _refuse_by_content(path: Path, picture: Any, views: int, panorama: bool) -> None:
+    """Raise a FormatError for a panorama as one view, or an animation of more frames than views."""
+    if views == 1 and not panorama and vr180.is_panorama(vr180.read_xmp(picture)):
         raise FormatError(
             f"{path}: expected an ordinary picture, found a VR180 picture or a 360-degree panorama "
-            "(according to its XMP metadata); export two ordinary views from it"
+            "(according to its XMP metadata)",
+            remedy=Remedy("give it alone if it holds both eyes, or choose the projection", ("projection",)),
         )
     count = _count_frames(path, picture)
     if count > views:

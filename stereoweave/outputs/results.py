@@ -17,6 +17,7 @@ import numpy as np
 
 from stereoweave import __version__
 from stereoweave.cameras.calibration_files import read_calibration_bytes
+from stereoweave.cameras.spherical import SphereRequest
 from stereoweave.errors import NameOf, Note, StereoweaveError, keyword
 from stereoweave.io.colormap import colour_disparity, find_colour_range_px, grey_confidence
 from stereoweave.io.files import make_folder, make_parent_folder, reading
@@ -155,6 +156,9 @@ def job_facts(job: DepthJob) -> dict[str, Any]:
             model = _hash_content(model, Path(model).read_bytes())
     facts = {"stereoweave": __version__, "model": model, **asdict(job.options)}
     request = asdict(job.request)
+    # Batches of earlier versions have no such setting.
+    if request.pop("sphere") != asdict(SphereRequest()):
+        facts["sphere"] = asdict(job.request.sphere)
     # In the stored descriptions of earlier batches, the format is called "arrangement".
     facts |= {"files": job.files, "always": job.always, "arrangement": request.pop("format"), **request}
     if calibration:

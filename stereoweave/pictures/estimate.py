@@ -5,15 +5,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
-from stereoweave.arguments import describe
+from stereoweave.arguments import check_kind, check_number, describe
 from stereoweave.cameras import auto_align
 from stereoweave.cameras.diagnosis import find_problems
+from stereoweave.cameras.spherical import SphereRequest
 from stereoweave.errors import Note, Remedy, StereoweaveError
 from stereoweave.io.arrays import ImageLike, as_rgb
 from stereoweave.matching.backend import Backend
 from stereoweave.matching.estimate import match
 from stereoweave.matching.options import MatchOptions
 from stereoweave.matching.providers import CPU
+from stereoweave.pictures.panoramas import SphereView, cut_pair
 from stereoweave.pictures.prepare import Prepared, Request, prepare
 from stereoweave.stereo import Estimate, StereoPair
 
@@ -31,6 +33,10 @@ def estimate(  # noqa: PLR0913 - all but the images are keyword-only and optiona
     raw: bool = False,
     range_px: tuple[float, float] | None = None,
     align: Literal["auto"] | None = None,
+    projection: str | None = None,
+    look_deg: tuple[float, float] | None = None,
+    fov_deg: float | None = None,
+    lens_fov_deg: float | None = None,
 ) -> Estimate:
     """Estimate both views' disparities, the confidence and the occlusion mask of a pair.
 
@@ -51,6 +57,12 @@ def estimate(  # noqa: PLR0913 - all but the images are keyword-only and optiona
             pair is aligned first (`auto_align.align`). The estimate then belongs to the aligned pair, which
             it holds as `pair`, with `notes` on what was changed and on problems that remain, such as two
             pictures of different scenes. Default: the images must be rectified, and are not checked.
+        projection: Projection of a VR180 or 360-degree file or pair: equirectangular, half_equirectangular,
+            fisheye or rectilinear. The estimate then belongs to a window of it, and holds the window's pair.
+            Default: detected if `left` is the path of one file, else rectilinear.
+        look_deg: Yaw and pitch of the window in degrees; default: straight ahead.
+        fov_deg: Field of view of the window in degrees, from 10 to 150; default: 90.
+        lens_fov_deg: Field of view of a fisheye lens in degrees; default: as the file says, or 180.
 
     Raises:
         ValueError: MatcherError for an unknown model or an unavailable provider, ProviderError for a provider
@@ -60,8 +72,9 @@ def estimate(  # noqa: PLR0913 - all but the images are keyword-only and optiona
         raise StereoweaveError(f"expected 'auto' or None, got {describe(align)}", setting="align")
     options = MatchOptions(range_px=range_px, refined=refined, raw=raw)
     backend = Backend(model=model, threads=threads, provider=provider)
+    sphere = _request_window(projection, look_deg, fov_deg, lens_fov_deg)
     if right is None:
-        prepared = _open_both(left, aligned=bool(align))
+        prepared = _open_both(left, sphere, aligned=bool(align))
         found = match(backend.matcher(), prepared.pair, options)
         notes = _fit_to_python(prepared.notes)
         if align:
@@ -69,18 +82,43 @@ def estimate(  # noqa: PLR0913 - all but the images are keyword-only and optiona
         return replace(found, pair=prepared.pair, notes=notes)
     given = StereoPair(left=as_rgb(left, "left"), right=as_rgb(right, "right"))
     matcher = backend.matcher()
+    chosen = sphere.choose("two images", None)
+    if chosen:
+        eye_size_px = given.left.shape[1], given.left.shape[0]
+        given = cut_pair(given, SphereView.chosen(chosen, eye_size_px, sphere))
     if not align:
-        return match(matcher, given, options)
+        found = match(matcher, given, options)
+        return replace(found, pair=given) if chosen else found
     aligned = auto_align.align(given)
     found = match(matcher, aligned.pair, options)
     notes = (
         *_fit_to_python(aligned.notes),
         *find_problems(aligned.pair, found, aligned.alignment, _RECTIFY_FIRST),
     )
-    return replace(found, pair=None if aligned.pair is given else aligned.pair, notes=notes)
+    is_given = aligned.pair is given and not chosen
+    return replace(found, pair=None if is_given else aligned.pair, notes=notes)
 
 
-def _open_both(file: ImageLike, *, aligned: bool) -> Prepared:
+def _request_window(
+    projection: str | None, look_deg: object, fov_deg: float | None, lens_fov_deg: float | None
+) -> SphereRequest:
+    """Return the request for a window; raise StereoweaveError for values of wrong types."""
+    if projection is not None:
+        check_kind("projection", projection, str)
+    for name, value in (("fov_deg", fov_deg), ("lens_fov_deg", lens_fov_deg)):
+        if value is not None:
+            check_number(name, value)
+    look = None
+    if look_deg is not None:
+        if not isinstance(look_deg, tuple) or len(look_deg) != 2:
+            raise StereoweaveError(f"look_deg: expected yaw and pitch, got {describe(look_deg)}")
+        for value in look_deg:
+            check_number("look_deg", value)
+        look = (float(look_deg[0]), float(look_deg[1]))
+    return SphereRequest(projection=projection, look_deg=look, fov_deg=fov_deg, lens_fov_deg=lens_fov_deg)
+
+
+def _open_both(file: ImageLike, sphere: SphereRequest, *, aligned: bool) -> Prepared:
     """Open the pair in one file with both views."""
     if not isinstance(file, str | Path):
         raise StereoweaveError(
@@ -88,12 +126,12 @@ def _open_both(file: ImageLike, *, aligned: bool) -> Prepared:
             setting="right",
             remedy=Remedy("give it, or the path of one file with both views"),
         )
-    return prepare([Path(file)], Request(rectify=None if aligned else False))
+    return prepare([Path(file)], Request(rectify=None if aligned else False, sphere=sphere))
 
 
 def _fit_to_python(notes: Iterable[Note]) -> tuple[Note, ...]:
     """Return notes without the remedies that name settings which `estimate` does not have."""
-    lacking = {"no_rectify", "format"}
+    lacking = {"no_rectify", "format", "whole"}
     return tuple(
         replace(note, remedy=None) if note.remedy and lacking & set(note.remedy.settings) else note
         for note in notes

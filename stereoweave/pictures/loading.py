@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
+from stereoweave.cameras.spherical import EQUIRECTANGULAR, HALF, RECTILINEAR, Projection, SphereRequest
 from stereoweave.errors import FormatError, Note, Remedy, StereoweaveError
-from stereoweave.io import exif, heif
+from stereoweave.io import exif, heif, vr180
 from stereoweave.io.decoding import (
     DecodedPicture,
     check_size,
@@ -22,6 +23,7 @@ from stereoweave.io.decoding import (
     read_picture,
 )
 from stereoweave.io.images import check_large_enough, make_pair
+from stereoweave.pictures import panoramas
 from stereoweave.pictures.pair_layouts import (
     PAIR_LAYOUTS,
     PairLayout,
@@ -55,22 +57,31 @@ class Opened:
             HEIC file with two views and an animation of two frames).
         notes: Notes on what was detected or changed.
         lens: Camera parameters from the metadata, in pixels of the pair; None if there are none.
+        projection: Projection of both images; None for ordinary ones.
+        sphere: Of a VR180 or 360-degree picture, the window of it that the pair shows.
     """
 
     pair: StereoPair
     layout: str
     notes: tuple[Note, ...] = ()
     lens: exif.Lens | None = None
+    projection: Projection | None = None
+    sphere: panoramas.SphereView | None = None
 
 
 @step("opening the pictures")
-def open_pictures(paths: Sequence[Path], format: str | None = None) -> Opened:
+def open_pictures(
+    paths: Sequence[Path], format: str | None = None, sphere: SphereRequest | None = None
+) -> Opened:
     """Open the pair in two pictures, left first, or in one file with both views.
+
+    Of VR180 and 360-degree pictures, the pair is a window of both eyes' images.
 
     Args:
         paths: One or two files.
         format: Layout of one file with both views, a name in `FORMATS`. Default: detected from the file
             format, the file name and the content, in this order.
+        sphere: Projection of the pictures, and the window to show. Default: detected, straight ahead.
 
     Raises:
         FormatError: A file is unreadable, is too large, has an unsupported format (named in the error) or
@@ -80,6 +91,7 @@ def open_pictures(paths: Sequence[Path], format: str | None = None) -> Opened:
     """
     if format not in (None, *FORMATS):
         raise StereoweaveError(f"expected one of {', '.join(FORMATS)}, found {format!r}", setting="format")
+    sphere = sphere or SphereRequest()
     match paths:
         case [left, right]:
             if format is not None:
@@ -88,9 +100,10 @@ def open_pictures(paths: Sequence[Path], format: str | None = None) -> Opened:
                     "omit this setting, and give the left picture first",
                     setting="format",
                 )
-            return _open_two(left, right)
+            panorama = sphere.projection not in (None, RECTILINEAR)
+            return _show_window(str(left), _open_two(left, right, panorama=panorama), sphere)
         case [both]:
-            return _open_one(both, format)
+            return _show_window(str(both), _open_one(both, format, sphere), sphere)
     names = " ".join(map(str, paths))
     raise StereoweaveError(
         f"expected two pictures, left and right, or one that holds both views, found {len(paths)}: {names}",
@@ -113,7 +126,7 @@ def pixel_factor(path: Path, picture: Image.Image, format: str | None) -> int:
     It is 2 for MPO and HEIC files with two views, for animations of two frames, and for half-size views
     declared by `format` or by the file's JPS header.
     """
-    if _find_frames(path, picture, format):
+    if _find_frames(path, picture, format) or b"GImage:" in vr180.read_xmp(picture):
         return 2
     known = PAIR_LAYOUTS.get(_read_declared(path, picture, format)[0] or "")
     return 2 if known is not None and known.half else 1
@@ -126,8 +139,29 @@ def _find_frames(path: Path, picture: Image.Image, format: str | None) -> list[i
     return find_view_frames(path, picture)
 
 
-def _open_two(left: Path, right: Path) -> Opened:
-    decoded = [read_picture(path) for path in (left, right)]
+def _show_window(name: str, opened: Opened, sphere: SphereRequest) -> Opened:
+    """Return what is to be shown of a VR180 or 360-degree picture; other pictures are returned unchanged."""
+    eye_size_px = opened.pair.left.shape[1], opened.pair.left.shape[0]
+    by_name = opened.projection is None and sphere.projection is None
+    guessed = panoramas.guess_projection(name, eye_size_px) if by_name else opened.projection
+    projection = sphere.choose(name, guessed)
+    if projection is None:
+        return opened
+    view = panoramas.SphereView.chosen(projection, eye_size_px, sphere)
+    why = ", detected from the name" if by_name else ""
+    baseline_m = opened.lens.baseline_m if opened.lens else None
+    return replace(
+        opened,
+        pair=panoramas.cut_pair(opened.pair, view),
+        notes=(*opened.notes, view.note(sphere, why)),
+        lens=exif.Lens(focal_px=view.window.focal_px, baseline_m=baseline_m, parallel=True),
+        projection=projection,
+        sphere=view,
+    )
+
+
+def _open_two(left: Path, right: Path, *, panorama: bool) -> Opened:
+    decoded = [read_picture(path, panorama=panorama) for path in (left, right)]
     lies, notes = _choose_orientations(*decoded)
     eyes = [each.upright(lie) for each, lie in zip(decoded, lies, strict=True)]
     return Opened(
@@ -138,8 +172,12 @@ def _open_two(left: Path, right: Path) -> Opened:
     )
 
 
-def _open_one(path: Path, format: str | None) -> Opened:
+def _open_one(path: Path, format: str | None, sphere: SphereRequest) -> Opened:
     with open_picture(path, views=2) as picture:
+        xmp = vr180.read_xmp(picture)
+        right_eye = None if format else panoramas.read_right_eye(path, picture, xmp)
+        if right_eye:
+            return _open_vr180(path, (decode(path, picture), right_eye), xmp, sphere)
         frames = _find_frames(path, picture, format)
         if frames and picture.format == "MPO":
             return _open_mpo(path, picture, frames)
@@ -157,6 +195,9 @@ def _open_one(path: Path, format: str | None) -> Opened:
     image = decoded.upright(lies)
     if name is None:
         name, why = _detect_picture_layout(path, image), "detected from name and content"
+    if vr180.is_panorama(xmp) or sphere.projection in (EQUIRECTANGULAR, HALF):
+        # Angles are shares of width and height, whatever their ratio: enlarging would add no detail.
+        name = name.removesuffix("_half")
     notes = [Note(f"{name}, {why}", _OVERRIDE)] if why else []
     layout = PAIR_LAYOUTS[name]
     left, right = _split_views(path, image, layout)
@@ -171,6 +212,44 @@ def _open_one(path: Path, format: str | None) -> Opened:
             *_note_colours([decoded]),
         ),
         lens=exif.read_lens(decoded.tags, width_px, height_px),
+        projection=_read_projection(path, xmp, (width_px, height_px), sphere),
+    )
+
+
+def _read_projection(
+    path: Path, xmp: bytes, eye_size_px: tuple[int, int], sphere: SphereRequest, *, one_eye: bool = False
+) -> Projection | None:
+    """Return the projection that XMP states, unless it is damaged and the user gives one.
+
+    Of a picture with both views, GPano may describe one of them or both together, so only the shape counts.
+    """
+    if not vr180.is_panorama(xmp):
+        return None
+    try:
+        if one_eye:
+            return panoramas.read_projection(path, xmp, eye_size_px)
+        return panoramas.find_by_aspect(path, eye_size_px)
+    except FormatError:
+        if sphere.projection is None:
+            raise
+        return None
+
+
+def _open_vr180(
+    path: Path, decoded: tuple[DecodedPicture, DecodedPicture], xmp: bytes, sphere: SphereRequest
+) -> Opened:
+    """Open a VR180 photo, whose right eye is in its metadata."""
+    lies = exif.read_orientation(decoded[0].tags)
+    left, right = (each.upright(lies) for each in decoded)
+    return Opened(
+        pair=_pair_views(path, "a VR180", left, right),
+        layout=TWO_PICTURES,
+        notes=(
+            Note("a VR180 photo, with the right eye in its metadata"),
+            *_note_turns(lies),
+            *_note_colours(decoded),
+        ),
+        projection=_read_projection(path, xmp, (left.shape[1], left.shape[0]), sphere, one_eye=True),
     )
 
 

@@ -10,13 +10,20 @@ from stereoweave.cameras.calibration_files import read_rig
 from stereoweave.cameras.diagnosis import GIVE_DOFFS
 from stereoweave.cameras.rectify import Rectified, rectify
 from stereoweave.cameras.rig import pair_size_px
+from stereoweave.cameras.sphere_windows import PerspectiveWindow
+from stereoweave.cameras.spherical import SphereRequest
 from stereoweave.errors import Note, Remedy, StereoweaveError
 from stereoweave.io.exif import Lens
-from stereoweave.pictures.loading import open_pictures
+from stereoweave.pictures.loading import Opened, open_pictures
+from stereoweave.pictures.panoramas import SphereView
 from stereoweave.stereo import StereoCamera, StereoPair
 from stereoweave.system.steps import step
 
 CALIBRATE = Remedy("give a calibration", ("calibration",))
+_NO_METRES_ON_CYLINDER = Note(
+    "no depth in metres: a window of a 360-degree picture is no perspective image",
+    Remedy("take the whole field of view for distances", ("whole",)),
+)
 _CALIBRATE_AGAIN = Remedy("give a calibration of these cameras", ("calibration",))
 
 
@@ -31,6 +38,7 @@ class Request:
             pictures' metadata.
         rectify: Whether to rectify the pair, using the calibration or, if there is none, feature matches.
             Default: `align` the pair, unless a calibration, focal length or baseline is given.
+        sphere: Projection and window of VR180 and 360-degree pictures.
     """
 
     format: str | None = None
@@ -38,6 +46,7 @@ class Request:
     focal_px: float | None = None
     baseline_m: float | None = None
     rectify: bool | None = None
+    sphere: SphereRequest = SphereRequest()
 
     def __post_init__(self) -> None:
         if self.calibration and not (self.focal_px is None and self.baseline_m is None):
@@ -53,7 +62,8 @@ class Prepared:
 
     `alignment` is the alignment of the pair, if it has been measured. `remedy` is what to do if rows are
     apart nevertheless. `is_new` says whether the left picture is in no file: the pair was rectified or
-    swapped, or its file holds both views.
+    swapped, or its file holds both views. `sphere` is the window of a VR180 or 360-degree picture, and
+    `baseline_m` the distance of its eyes, if known.
     """
 
     pair: StereoPair
@@ -62,6 +72,8 @@ class Prepared:
     alignment: Alignment | None = None
     remedy: Remedy = RECTIFY
     is_new: bool = False
+    sphere: SphereView | None = None
+    baseline_m: float | None = None
 
 
 @step("opening the pictures")
@@ -77,7 +89,9 @@ def prepare(pictures: Sequence[Path], request: Request) -> Prepared:
         StereoweaveError: See `open_pictures`, `read_rig`, `rectify` and `rectify_by_features`; or the request
             gives only one of focal length and baseline, and EXIF lacks the other.
     """
-    opened = open_pictures(pictures, request.format)
+    opened = open_pictures(pictures, request.format, request.sphere)
+    if opened.sphere:
+        return _prepare_window(pictures, opened, request)
     if request.calibration:
         ready = _apply_calibration(opened.pair, request.calibration, bool(request.rectify))
         return Prepared(
@@ -102,6 +116,39 @@ def prepare(pictures: Sequence[Path], request: Request) -> Prepared:
         alignment=found.alignment,
         remedy=RECTIFY if rectified is False else CALIBRATE,
         is_new=_is_new(pictures, opened.pair, found.pair),
+    )
+
+
+def _prepare_window(pictures: Sequence[Path], opened: Opened, request: Request) -> Prepared:
+    """Prepare a window of a VR180 or 360-degree picture, whose focal length and axes are known.
+
+    Only a perspective image is rectified where needed: homographies do not fit others.
+    """
+    if request.calibration or request.focal_px is not None:
+        raise StereoweaveError(
+            f"{pictures[0]}: expected no calibration and no focal length, which follow from the projection",
+            remedy=Remedy("omit them", ("calibration", "focal_px")),
+        )
+    assert opened.sphere and opened.lens
+    window, pair, notes = opened.sphere.window, opened.pair, list(opened.notes)
+    baseline_m = opened.lens.baseline_m if request.baseline_m is None else request.baseline_m
+    if baseline_m is not None:
+        pair = replace(pair, camera=window.camera(baseline_m))
+    is_flat = isinstance(window, PerspectiveWindow)
+    if baseline_m is not None and not is_flat and not request.sphere.whole:
+        notes.append(_NO_METRES_ON_CYLINDER)
+    rectified = request.rectify if is_flat else False
+    if request.baseline_m is not None and rectified is None:
+        rectified = False
+    found = _align(pair, rectified, parallel=True)
+    return Prepared(
+        pair=found.pair,
+        pictures=tuple(pictures),
+        notes=(*notes, *found.notes),
+        alignment=found.alignment,
+        is_new=True,
+        sphere=opened.sphere,
+        baseline_m=baseline_m,
     )
 
 

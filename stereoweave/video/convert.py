@@ -23,8 +23,10 @@ from stereoweave.video.carried_frames import rehearse_carrying
 from stereoweave.video.frame_converter import FrameConverter, VideoTally, load_matcher
 from stereoweave.video.job import VideoJob
 from stereoweave.video.layout_marks import mark_layout
+from stereoweave.video.mp4_marks import VideoMarks
 from stereoweave.video.parts import open_parts
 from stereoweave.video.reader import StereoVideo, format_time
+from stereoweave.video.sphere_output import WholeOutput
 from stereoweave.video.survey import survey_video
 from stereoweave.video.tracks import list_picture_files
 from stereoweave.video.writer import (
@@ -75,6 +77,7 @@ def convert_video(
             because the disk is full.
     """
     _check_output(out, job, video, sources)
+    job = _fit_to_sphere(job, video)
     matcher = load_matcher(job)
     compile_ahead(rehearse_carrying, *_list_rehearsals(job))
     if job.is_fine:
@@ -112,13 +115,7 @@ def convert_video(
             with parts.next(converter.state) as path, closing(converter.convert(part)) as pictures:
                 recorder.write_part(path, map(meter.count, pictures))
         said = job.describe_values(converter.survey, video.camera, rectified=converter.has_warped)
-        marks = mark_layout(
-            job.layout,
-            None if converter.has_warped else video.camera,
-            video.size_px[0],
-            strength=job.strength,
-            convergence_px=job.convergence_px or 0.0,
-        )
+        marks = _mark_output(job, video, warped=converter.has_warped)
         recorder.join(parts.files, video.sound, out, said, marks)
     return replace(converter.tally, frames_per_s=meter.frames_per_s)
 
@@ -135,6 +132,39 @@ def _list_rehearsals(job: VideoJob) -> tuple[Rehearsal, ...]:
     if job.depth or job.depth10 or job.depth16:
         return ()
     return (rehearse_fine_drawing,) if job.is_fine else (rehearse_drawing, rehearse_filling)
+
+
+def _fit_to_sphere(job: VideoJob, video: StereoVideo) -> VideoJob:
+    """Return the job as it is for a window of a VR180 or 360-degree video, or for the whole of it."""
+    if video.sphere is None:
+        return job
+    # The homographies that rectify shots fit perspective images only.
+    job = replace(job, rectify=job.rectify and video.sphere.is_flat)
+    if not video.sphere.is_whole:
+        return job
+    if job.depth10 or job.depth16:
+        raise StereoweaveError(
+            "expected depth in colour for the whole field of view",
+            setting="depth10" if job.depth10 else "depth16",
+        )
+    if job.is_fine:
+        raise StereoweaveError(f"expected 8 for the whole field of view, found {job.bits}", setting="bits")
+    return replace(job, whole=WholeOutput(video.sphere, job.layout))
+
+
+def _mark_output(job: VideoJob, video: StereoVideo, *, warped: bool) -> VideoMarks | None:
+    """Return what the output says about its views and cameras."""
+    if job.whole is not None:
+        return job.whole.marks(video.baseline_m)
+    # Of a window aside, the marks cannot say that its middle is elsewhere.
+    aside = video.camera is not None and abs(2 * video.camera.cx_px + 1 - video.size_px[0]) > 1
+    return mark_layout(
+        job.layout,
+        None if warped or aside else video.camera,
+        video.size_px[0],
+        strength=job.strength,
+        convergence_px=job.convergence_px or 0.0,
+    )
 
 
 class _Meter:
@@ -192,6 +222,7 @@ def _list_settings(job: VideoJob, video: StereoVideo, sources: Sequence[Path]) -
         "model": _identify_source(model) if model.exists() else str(job.backend.model),
         "film": [_identify_source(source) for source in sources],
         "stereoweave": __version__,
+        **({"projection": str(video.sphere)} if video.sphere else {}),
     }
 
 

@@ -15,6 +15,7 @@ from stereoweave.rendering.layouts import LAYOUTS, Eye, LayoutOptions, check_pos
 from stereoweave.rendering.renderer import Renderer
 from stereoweave.stereo import Estimate, StereoCamera, StereoPair
 from stereoweave.video.reader import FinePair
+from stereoweave.video.sphere_output import WholeOutput
 from stereoweave.video.survey import Survey
 from stereoweave.video.writer import Picture
 
@@ -46,6 +47,7 @@ class VideoJob:
         convergence_px: Disparity of the points that stay in the same column in all views. Default: the median
             disparity of the scene for layouts that overlay their views, 0 for all others.
         rectify: Whether to rectify the shots whose rows are apart, and to swap the sides if they are swapped.
+        whole: Output for the whole field of view of a VR180 or 360-degree video; None for a window.
         backend: Backend that matches the frames.
         name_of: Function that returns the front end's name for a setting, used in notes.
     """
@@ -59,6 +61,7 @@ class VideoJob:
     strength: float = 1.0
     convergence_px: float | None = None
     rectify: bool = True
+    whole: WholeOutput | None = None
     backend: Backend = Backend()
     name_of: NameOf = keyword
 
@@ -124,9 +127,13 @@ class VideoJob:
         """Function that makes the output from the pictures of both cameras; None if it shows their depth."""
         if self.strength != 1 or self.convergence_px:
             return None
+        join = self._arrangement
         if self.position in (0, 1):
-            return lambda left, right: right if self.position else left
-        return self._arrangement
+            join = _take_right if self.position else _take_left
+        if join is None or self.whole is None:
+            return join
+        spread, arrange = self.whole.spread, join
+        return lambda left, right: spread(arrange(left, right))
 
     @property
     def is_fine(self) -> bool:
@@ -153,6 +160,12 @@ class VideoJob:
 
     def render_frame(self, pair: StereoPair, estimate: Estimate, survey: Survey) -> Picture:
         """Render the output image of one frame."""
+        if self.whole is None:
+            return self._render_pair(pair, estimate, survey)
+        seen = self.whole.measure_nearness(estimate) if self.depth else estimate
+        return self.whole.spread(self._render_pair(pair, seen, survey))
+
+    def _render_pair(self, pair: StereoPair, estimate: Estimate, survey: Survey) -> Picture:
         if self.depth:
             return colour_disparity(estimate.disparity_px, survey.range_px)
         if self.depth10:
@@ -226,6 +239,14 @@ class VideoJob:
         if self.layout == "rgbd":
             return {"comment": f"disparity in grey: {low_px:.2f} px is black, {high_px:.2f} px is white"}
         return {}
+
+
+def _take_left(left: Eye, right: Eye) -> Eye:
+    return left
+
+
+def _take_right(left: Eye, right: Eye) -> Eye:
+    return right
 
 
 def _describe_disparity(disparity_px: float, camera: StereoCamera | None) -> str:

@@ -6,7 +6,7 @@ from stereoweave.stereo import StereoCamera
 from stereoweave.video.mp4_marks import VideoMarks
 
 # The packing of each layout with one view for each eye, and whether the right view comes first.
-_PACKED = {
+PACKED = {
     "side_by_side": ("side_by_side", False),
     "side_by_side_half": ("side_by_side", False),
     "crossed": ("side_by_side", True),
@@ -28,9 +28,9 @@ def mark_layout(
         convergence_px: Disparity that the views were shifted by. The baseline is then left out, because
             depth could no longer be computed from it.
     """
-    if layout not in _PACKED:
+    if layout not in PACKED:
         return None
-    packing, right_first = _PACKED[layout]
+    packing, right_first = PACKED[layout]
     if camera is None:
         return VideoMarks(packing=packing, right_first=right_first)
     baseline_m = strength * camera.baseline_m

@@ -12,8 +12,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import UInt8
 
+from stereoweave.cameras.sphere_remap import Cutter
+from stereoweave.cameras.spherical import FISHEYE, RECTILINEAR, SphereRequest
 from stereoweave.errors import FormatError, Note, Remedy, StereoweaveError
 from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS, detect_layout
+from stereoweave.pictures.panoramas import SphereView, guess_projection
 from stereoweave.video.tracks import Shot, Track, VideoTrack, open_track
 
 # A spatial video is refused if none of this many images is followed by its second view.
@@ -72,6 +75,9 @@ class StereoVideo:
         notes: Notes on views and colours, and on the column or row that is dropped from frames of odd width
             or height.
         hdr_colours: Primaries, transfer function and matrix of HDR, by FFmpeg's numbers; None for SDR.
+        declared_sphere: Projection of a VR180 or 360-degree video, if the file declares one.
+        sphere: Of a VR180 or 360-degree video, the window that its frames show; see `show`.
+        baseline_m: Distance of the eyes of such a video; None if it is unknown.
         on_frame: Function that `frames` calls with the number of each frame that it yields, to show progress.
     """
 
@@ -96,6 +102,10 @@ class StereoVideo:
         self.sound = next((track.sound for track in tracks if track.sound), None)
         self.on_frame: Callable[[int], None] = lambda number: None
         self.excerpted: str | None = None
+        self.declared_sphere = first.sphere
+        self.sphere: SphereView | None = None
+        self.baseline_m: float | None = None
+        self._cutter: Cutter | None = None
         self._first, self._last = 0, self.frame_count - 1
         self.hdr_colours = first.hdr_colours
         self._reads_fine = False
@@ -104,6 +114,16 @@ class StereoVideo:
         """From now on, yield frames with fine pictures; notes no longer say that HDR is tone-mapped."""
         self._reads_fine = True
         self.notes = tuple(_note_kept(note) for note in self.notes)
+
+    def show(self, view: SphereView, baseline_m: float | None, note: Note) -> "StereoVideo":
+        """Return the same video with windows of its VR180 or 360-degree frames as frames."""
+        shown = copy.copy(self)
+        shown.sphere, shown._cutter = view, view.cutter()
+        shown.size_px = view.window.size_px
+        shown.baseline_m = baseline_m
+        shown.camera = None if baseline_m is None else view.window.camera(baseline_m)
+        shown.notes = (*self.notes, note)
+        return shown
 
     def excerpt(self, start_s: float, length_s: float) -> "StereoVideo":
         """Return a part of the video as a silent video of its own, whose times and numbers begin at 0.
@@ -140,6 +160,8 @@ class StereoVideo:
         for index, seen in zip(range(first + start, first + self.frame_count), every_track, strict=False):
             pictures = [picture for shot, _ in seen for picture in shot.pictures()]
             left, right = self._split.eyes(*pictures) if self._split else pictures
+            if self._cutter:
+                left, right = self._cutter.cut(left), self._cutter.cut(right)
             time = (steps[index] - steps[first]) * self.time_base
             self.on_frame(index - first)
             problem = self._describe_problem(index, [problem for _, problem in seen])
@@ -149,7 +171,7 @@ class StereoVideo:
     def _split_fine(self, shots: Sequence[Shot]) -> FinePair:
         pictures = [picture for shot in shots for picture in shot.fine_pictures()]
         left, right = self._split.eyes(*pictures) if self._split else pictures
-        return left, right
+        return (self._cutter.cut(left), self._cutter.cut(right)) if self._cutter else (left, right)
 
     def _describe_problem(self, index: int, problems: Sequence[str | None]) -> str | None:
         of_two = len(self._tracks) == 2
@@ -170,7 +192,11 @@ class StereoVideo:
 
 
 def open_video(
-    paths: Sequence[Path], format: str | None = None, *, rate: Fraction | None = None
+    paths: Sequence[Path],
+    format: str | None = None,
+    *,
+    rate: Fraction | None = None,
+    sphere: SphereRequest | None = None,
 ) -> StereoVideo:
     """Open a stereo video from one file with both eyes, or from a left and a right file.
 
@@ -182,6 +208,7 @@ def open_video(
         format: Frame packing of a single video, a name in `PAIR_LAYOUTS`; none for a spatial video. Default:
             detected.
         rate: Frame rate for pictures, in frames per second. Default: 25.
+        sphere: Projection of the video, and the window to show. Default: detected, straight ahead.
 
     Raises:
         FormatError: A file cannot be read, is not 3-D, does not match the other file, or has frames that
@@ -199,6 +226,11 @@ def open_video(
             f"found {len(paths)}: {' '.join(map(str, paths))}"
         )
     tracks = [open_track(path, rate) for path in paths]
+    return _show_window(_combine(tracks, format, sphere or SphereRequest()), sphere or SphereRequest())
+
+
+def _combine(tracks: Sequence[Track], format: str | None, sphere: SphereRequest) -> StereoVideo:
+    """Combine two tracks, or open the only one."""
     if len(tracks) == 2:
         _check_alike(*tracks)
         return StereoVideo(tracks, None)
@@ -208,10 +240,26 @@ def open_video(
         _check_second_view(track)
         return StereoVideo(tracks, None)
     name = format or detect_layout(track.name, track.samples(), track.declared_packing)
+    if track.sphere or sphere.projection not in (None, RECTILINEAR, FISHEYE):
+        # Angles are shares of width and height, whatever their ratio: enlarging would add no detail.
+        name = name.removesuffix("_half")
     try:
         return StereoVideo(tracks, name)
     except FormatError as error:
         raise FormatError(f"{track.name}: {error}") from error
+
+
+def _show_window(video: StereoVideo, request: SphereRequest) -> StereoVideo:
+    """Return what is to be shown of a VR180 or 360-degree video; other videos are returned unchanged."""
+    declared = video.declared_sphere
+    by_name = declared is None and request.projection is None
+    named = guess_projection(video.name, video.size_px) if by_name else None
+    projection = request.choose(video.name, declared.projection if declared else named)
+    if projection is None:
+        return video
+    view = SphereView.chosen(projection, video.size_px, request)
+    note = view.note(request, ", detected from the name" if by_name else "")
+    return video.show(view, declared.baseline_m if declared else None, note)
 
 
 def check_unpacked(name: str, format: str | None) -> None:

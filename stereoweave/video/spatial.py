@@ -127,8 +127,8 @@ def read_stereo3d(frame: "av.VideoFrame") -> Stereo3D | None:
     """
     from av.sidedata.sidedata import Type
 
-    side_data = _read_side_data(frame)
-    said = _parse_stereo3d(side_data.get(Type.STEREO3D, b""))
+    side_data = read_side_data(frame)
+    said = parse_stereo3d(side_data.get(Type.STEREO3D, b""))
     if said is None:
         return None
     if _is_panorama(side_data.get(Type.SPHERICAL)):
@@ -137,11 +137,12 @@ def read_stereo3d(frame: "av.VideoFrame") -> Stereo3D | None:
         return said
     # The container's word comes first, and hides behind the stream's.
     every = [side_data[index] for index in range(len(side_data))]
-    first = _parse_stereo3d(next((data for data in every if data.type == Type.STEREO3D), b"")) or said
+    first = parse_stereo3d(next((data for data in every if data.type == Type.STEREO3D), b"")) or said
     return replace(first, kind=said.kind, is_inverted=said.is_inverted, view=said.view)
 
 
-def _parse_stereo3d(data: Any) -> Stereo3D | None:
+def parse_stereo3d(data: Any) -> Stereo3D | None:
+    """Return what FFmpeg's AVStereo3D says; None if it is cut off."""
     numbers = bytes(data)
     if len(numbers) < _STEREO3D_BYTES:
         return None
@@ -158,7 +159,7 @@ def _parse_stereo3d(data: Any) -> Stereo3D | None:
     )
 
 
-def _read_side_data(frame: "av.VideoFrame") -> Any:
+def read_side_data(frame: "av.VideoFrame") -> Any:
     """Return a frame's side data by type; {} if one of them has no name in PyAV and FFmpeg's filter."""
     # The type stubs of PyAV lack some kinds of side data.
     with suppress(ValueError):

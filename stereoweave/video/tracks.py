@@ -20,6 +20,7 @@ from stereoweave.io.images import read_image
 from stereoweave.stereo import StereoCamera
 from stereoweave.video.colours import convert_to_fine, convert_to_rgb, hdr_colours, name_hdr
 from stereoweave.video.spatial import Stereo3D, ViewPair, is_spatial, pair_views, read_stereo3d
+from stereoweave.video.sphere_marks import SphereMark, read_sphere
 
 if TYPE_CHECKING:
     import av
@@ -78,6 +79,7 @@ class VideoTrack:
             an unsupported packing; None if the file declares no packing, or is a spatial video.
         is_spatial: Whether the video is a spatial one (MV-HEVC), with each view in a layer of its own.
         camera: Camera of the views of a spatial video, if the file declares it and rotates no views.
+        sphere: Projection of a VR180 or 360-degree video, if the file declares one.
         notes: Notes on views and colours.
         hdr_colours: Primaries, transfer function and matrix of HDR, by FFmpeg's numbers; else None.
         sound: Path of the file if it has sound, else None.
@@ -111,6 +113,7 @@ class VideoTrack:
         has_camera = self.is_spatial and first.rotation % 360 == 0
         self.camera = declared.camera(self._frame_size_px) if has_camera else None
         self._packed = declared if first.rotation % 360 == 0 and not self.is_spatial else Stereo3D()
+        self.sphere = read_sphere(self.name, first)
         self.notes = [declared.note()] if self.is_spatial else []
         self.hdr_colours = hdr_colours(first)
         if hdr := name_hdr(first):
@@ -235,6 +238,7 @@ class PictureTrack:
     declared_packing: str | None = None
     is_spatial = False
     camera: StereoCamera | None = None
+    sphere: SphereMark | None = None
     notes: Sequence[Note] = ()
     hdr_colours: tuple[int, int, int] | None = None
     retimed: Collection[int] = ()
