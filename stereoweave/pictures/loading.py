@@ -22,6 +22,7 @@ from stereoweave.io.decoding import (
     read_picture,
 )
 from stereoweave.io.images import check_large_enough, make_pair
+from stereoweave.pictures.interleaved import InterleavedLayout
 from stereoweave.pictures.pair_layouts import (
     PAIR_LAYOUTS,
     PairLayout,
@@ -40,7 +41,7 @@ _OVERRIDE = Remedy("override it if it is wrong", ("format",))
 # other.
 _OTHER_LAYOUTS = {"a quilt of many views": r"_qs\d+x\d+a[\d.]+$", "a picture and its depth": r"_RGBD$"}
 
-_JPS_MARK, _JPS_STEREO, _JPS_BESIDE, _JPS_ABOVE = b"_JPSJPS_", 1, 2, 3
+_JPS_MARK, _JPS_STEREO, _JPS_INTERLEAVED, _JPS_BESIDE, _JPS_ABOVE = b"_JPSJPS_", 1, 1, 2, 3
 _JPS_HALF_HEIGHT, _JPS_HALF_WIDTH, _JPS_LEFT_FIRST = 1, 2, 4
 _CROSSED_ENDINGS = (".jps", ".pns")
 
@@ -300,10 +301,13 @@ def _read_declared(path: Path, picture: Image.Image, format: str | None) -> tupl
         is_jps = format == "jps" or path.suffix.lower() in _CROSSED_ENDINGS
         return ("crossed", "the default of .jps files") if is_jps else (None, None)
     flags, layout = mark[11], mark[12]
+    if layout == _JPS_INTERLEAVED:
+        name = "row_interleaved" if flags & _JPS_LEFT_FIRST else "row_interleaved_right_first"
+        return name, "from its JPS header"
     if layout not in (_JPS_BESIDE, _JPS_ABOVE):
         raise FormatError(
-            f"{path}: expected two views side by side or one above the other, found a JPS file that is "
-            "interleaved or an anaglyph; save it side by side"
+            f"{path}: expected two views side by side, one above the other or interleaved, found a JPS file "
+            "that is an anaglyph; save it side by side"
         )
     beside = layout == _JPS_BESIDE
     half = bool(flags & (_JPS_HALF_WIDTH if beside else _JPS_HALF_HEIGHT))
@@ -321,7 +325,7 @@ def _detect_picture_layout(path: Path, image: UInt8[np.ndarray, "h w 3"]) -> str
 
 
 def _split_views(
-    path: Path, image: UInt8[np.ndarray, "h w 3"], layout: PairLayout
+    path: Path, image: UInt8[np.ndarray, "h w 3"], layout: PairLayout | InterleavedLayout
 ) -> tuple[UInt8[np.ndarray, "h2 w2 3"], UInt8[np.ndarray, "h2 w2 3"]]:
     """Split an image into the left and the right view, both at full size."""
     height_px, width_px = image.shape[:2]

@@ -229,6 +229,5 @@ def _find_swapped_packing(frame_packing: str | None) -> str | None:
     """Return the name of the frame packing with the eyes swapped, or None if no such packing exists."""
     if frame_packing is None:
         return None
-    split = PAIR_LAYOUTS[frame_packing]
-    other = split._replace(right_first=not split.right_first)
+    other = PAIR_LAYOUTS[frame_packing].swapped()
     return next((name for name, known in PAIR_LAYOUTS.items() if known == other), None)

@@ -30,11 +30,11 @@ _SAMPLES = 0.1, 0.3, 0.5, 0.7, 0.9
 _STEREO_3D = {
     1: "side_by_side",
     2: "top_bottom",
-    3: "frame_sequence",
+    3: "frame_sequential",
     4: "checkerboard",
     5: "side_by_side_quincunx",
-    6: "lines",
-    7: "columns",
+    6: "row_interleaved",
+    7: "column_interleaved",
 }
 
 # Type of the first box in an MP4 or MOV file, which follows the four bytes of the box's length.
@@ -72,8 +72,8 @@ class VideoTrack:
         time_base: Time unit in seconds.
         rate: Average frames per second.
         size_px: Width and height of a whole frame after the rotation that players apply.
-        declared_packing: Frame packing declared in the file, either a full-size packing in `PAIR_LAYOUTS` or
-            an unsupported packing; None if the file declares no packing, or is a spatial video.
+        declared_packing: Frame packing declared in the file, a packing in `PAIR_LAYOUTS` other than of half
+            size, or an unsupported packing; None if the file declares no packing, or is a spatial video.
         is_spatial: Whether the video is a spatial one (MV-HEVC), with each view in a layer of its own.
         camera: Camera of the views of a spatial video, if the file declares it and rotates no views.
         notes: Notes on views and colours.
