@@ -198,9 +198,18 @@ def _extract_detail(picture: Picture) -> Float32[np.ndarray, "120 160"]:
     return shades - cv2.GaussianBlur(shades, (0, 0), _WINDOW_PX / 5)
 
 
+def show_same_scene(pairs: Sequence[tuple[Picture, Picture]]) -> bool:
+    """Return whether both pictures of most pairs show the same scene, or all are too plain to tell."""
+    return not _score_pairs(pairs) < _ALIKE
+
+
 def _score_halves(kind: str, frames: Sequence[Frame]) -> float:
-    """Return the median resemblance of the frames' halves; NaN if all frames are too plain."""
-    scores = [measure_resemblance(*_split_halves(kind, frame)) for frame in frames]
+    return _score_pairs([_split_halves(kind, frame) for frame in frames])
+
+
+def _score_pairs(pairs: Sequence[tuple[Picture, Picture]]) -> float:
+    """Return the median resemblance of the pairs; NaN if all are too plain."""
+    scores = [measure_resemblance(*pair) for pair in pairs]
     known = [score for score in scores if not np.isnan(score)]
     return float(np.median(known)) if known else np.nan
 
