@@ -43,8 +43,8 @@ def test_the_second_view_of_a_blu_ray_is_named(tmp_path, plain, units, ending):
             open_video([path], format)
         assert str(caught.value) == (
             f"{path}: expected views that can be decoded, found MVC (H.264 Stereo High, as on 3-D Blu-rays), "
-            "of which FFmpeg decodes one view alone; convert it to side by side by a program that decodes both, "
-            "such as BD3D2MK3D or FRIM"
+            "of which FFmpeg decodes one view alone; convert it to side by side by a program that decodes "
+            "both, such as BD3D2MK3D or FRIM"
         )
 
 
