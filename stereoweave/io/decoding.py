@@ -91,7 +91,15 @@ def read_picture(path: Path) -> DecodedPicture:
         return decode(path, picture)
 
 
-def decode(path: Path, picture: Image.Image) -> DecodedPicture:
+def read_embedded_picture(name: str, content: bytes) -> DecodedPicture:
+    """Decode a picture with one view that is part of another file; error messages call it `name`."""
+    with _decoding(name):
+        picture = _open(name, io.BytesIO(content), 1)
+    check_size(name, picture.size)
+    return decode(name, picture)
+
+
+def decode(path: str | Path, picture: Image.Image) -> DecodedPicture:
     """Decode an open picture, or the current frame if it has several."""
     stated_px = picture.size
     with _decoding(path):
@@ -261,7 +269,7 @@ def _count_frames(path: Path, picture: Any) -> int:
         return int(picture.n_frames)
 
 
-def _to_eight_bits(path: Path, picture: Image.Image) -> Image.Image:
+def _to_eight_bits(path: str | Path, picture: Image.Image) -> Image.Image:
     """Convert a loaded 16-bit grey picture, or a 32-bit one with 16-bit values, to 8-bit RGB."""
     with _decoding(path):
         values = np.asarray(picture)

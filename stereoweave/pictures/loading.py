@@ -11,13 +11,14 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from stereoweave.errors import FormatError, Note, Remedy, StereoweaveError
-from stereoweave.io import exif, heif
+from stereoweave.io import exif, heif, lif
 from stereoweave.io.decoding import (
     DecodedPicture,
     check_size,
     decode,
     find_view_frames,
     open_picture,
+    read_embedded_picture,
     read_frame,
     read_picture,
 )
@@ -53,7 +54,7 @@ class Opened:
     Attributes:
         pair: Both views, upright and in sRGB.
         layout: Layout of the files, which is a name in `PAIR_LAYOUTS`, "mpo" or "two_pictures" (also for a
-            HEIC file with two views and an animation of two frames).
+            HEIC or LIF file with two views and an animation of two frames).
         notes: Notes on what was detected or changed.
         lens: Camera parameters from the metadata, in pixels of the pair; None if there are none.
     """
@@ -111,10 +112,10 @@ def _advise_on_count(paths: Sequence[Path]) -> Remedy | None:
 def pixel_factor(path: Path, picture: Image.Image, format: str | None) -> int:
     """Return the ratio, 1 or 2, of the number of pixels in both views to the number in the file's header.
 
-    It is 2 for MPO and HEIC files with two views, for animations of two frames, and for half-size views
+    It is 2 for MPO, HEIC and LIF files with two views, for animations of two frames, and for half-size views
     declared by `format` or by the file's JPS header.
     """
-    if _find_frames(path, picture, format):
+    if (format is None and lif.is_lif(path)) or _find_frames(path, picture, format):
         return 2
     known = PAIR_LAYOUTS.get(_read_declared(path, picture, format)[0] or "")
     return 2 if known is not None and known.half else 1
@@ -141,6 +142,9 @@ def _open_two(left: Path, right: Path) -> Opened:
 
 def _open_one(path: Path, format: str | None) -> Opened:
     with open_picture(path, views=2) as picture:
+        views = lif.read_lif(path) if format is None else None
+        if views:
+            return _open_lif(path, picture, views)
         frames = _find_frames(path, picture, format)
         if frames and picture.format == "MPO":
             return _open_mpo(path, picture, frames)
@@ -208,6 +212,27 @@ def _open_heif(path: Path, picture: Image.Image, frames: Sequence[int]) -> Opene
     )
 
 
+def _open_lif(path: Path, picture: Image.Image, views: lif.LifViews) -> Opened:
+    """Open the pair in a LIF file, one view of which is the open picture."""
+    decoded = [
+        decode(path, picture)
+        if view.picture is None
+        else read_embedded_picture(f"{path}, {side} view", view.picture)
+        for side, view in (("left", views.left), ("right", views.right))
+    ]
+    lies, notes = _choose_orientations(*decoded)
+    eyes = [each.upright(lie) for each, lie in zip(decoded, lies, strict=True)]
+    which = "left and right view" if views.view_count == 2 else f"the outermost of {views.view_count} views"
+    pair = _pair_views(path, "a LIF", *eyes)
+    height_px, width_px = pair.left.shape[:2]
+    return Opened(
+        pair=pair,
+        layout=TWO_PICTURES,
+        notes=(Note(f"a LIF file, {which}", _OVERRIDE), *notes, *_note_colours(decoded)),
+        lens=_complete_lens(views.find_lens(width_px, height_px), _read_lens(decoded)),
+    )
+
+
 def _pair_views(
     path: Path, kind: str, left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h2 w2 3"]
 ) -> StereoPair:
@@ -220,7 +245,7 @@ def _pair_views(
 
 
 def _complete_lens(lens: exif.Lens | None, by_exif: exif.Lens | None) -> exif.Lens | None:
-    """Return a lens of a HEIC file, completed from EXIF."""
+    """Return a lens of a HEIC or LIF file, completed from EXIF."""
     if lens is None or by_exif is None:
         return lens or by_exif
     return replace(
