@@ -18,7 +18,7 @@ from jaxtyping import Shaped, UInt8
 from PIL import Image, UnidentifiedImageError, features
 
 from stereoweave.errors import FormatError, Remedy, reason
-from stereoweave.io import exif, heif
+from stereoweave.io import exif, heif, raw
 from stereoweave.io.colour_profiles import make_profile
 from stereoweave.io.similar_names import as_typed, describe_missing
 from stereoweave.stereo import LONGEST_SIDE_PX
@@ -35,10 +35,6 @@ ENDINGS = heif.ENDINGS | {
 # JPS.
 _KINDS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "GIF", "PPM", "AVIF", "JPEG2000")
 _ANIMATIONS = ("GIF", "PNG", "WEBP", "AVIF")
-_RAW_ENDINGS = {
-    *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dng", ".erf", ".iiq", ".kdc", ".mrw", ".nef", ".nrw", ".orf"),
-    *(".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw", ".x3f"),
-}
 _VIDEO_ENDINGS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v", ".wmv")
 _AVIF_BRANDS = {b"avif", b"avis"}
 _MP_ENTRIES, _DISPARITY = 0xB002, "Multi-Frame Image: (Disparity)"
@@ -74,12 +70,11 @@ def open_picture(path: Path, *, views: int = 1, expected: str = A_PICTURE) -> It
     with _decoding(path, expected), path.open("rb") as file:
         brands = _find_brands(file.read(64))
     _refuse_by_name(path, brands)
-    is_heif = not brands & _AVIF_BRANDS and bool(brands & heif.BRANDS)
     with _decoding(path, expected):
-        picture = heif.open_heif(path) if is_heif else _open(path, path, views)
+        picture, sizes_px = _open_any(path, brands, views)
     with picture:
         # The sizes of all pictures: Pillow allocates memory when it seeks one.
-        for size_px in (picture.size, *(heif.read_sizes(path) if is_heif else ())):
+        for size_px in (picture.size, *sizes_px):
             check_size(path, size_px, views=views)
         _refuse_by_content(path, picture, views)
         yield picture
@@ -197,6 +192,16 @@ def _describe_other(path: str | Path) -> str:
     return "an empty file; copy it again" if is_empty else "another type of file; save it as PNG or JPEG"
 
 
+def _open_any(path: Path, brands: set[bytes], views: int) -> tuple[Image.Image, list[tuple[int, int]]]:
+    """Open a picture of any format; return it, and the sizes that it states beside its own."""
+    if path.suffix.lower() in raw.ENDINGS:
+        developed = raw.open_raw(path)
+        return developed, [developed.sensor_size_px]
+    if not brands & _AVIF_BRANDS and brands & heif.BRANDS:
+        return heif.open_heif(path), heif.read_sizes(path)
+    return _open(path, path, views), []
+
+
 def _open(path: str | Path, source: Path | io.BytesIO, views: int) -> Image.Image:
     try:
         return Image.open(source, formats=_KINDS)
@@ -222,16 +227,12 @@ def _find_brands(head: bytes) -> set[bytes]:
 def _refuse_by_name(path: Path, brands: set[bytes]) -> None:
     """Raise a FormatError for an unsupported format, detected from the file name or the brands."""
     ending = path.suffix.lower()
-    if ending in _RAW_ENDINGS:
-        raise FormatError(
-            f"{path}: expected {A_PICTURE}, found a camera raw file; convert it to one of these formats first"
-        )
     if brands & _AVIF_BRANDS:
         if not features.check("avif"):
             raise FormatError(
                 f"{path}: expected {A_PICTURE}, found AVIF, which the installed Pillow cannot read"
             )
-    elif not brands & heif.BRANDS and (brands or ending in _VIDEO_ENDINGS):
+    elif ending not in raw.ENDINGS and not brands & heif.BRANDS and (brands or ending in _VIDEO_ENDINGS):
         raise FormatError(
             f"{path}: expected {A_PICTURE}, found a video", remedy=Remedy("convert it as such", ("video",))
         )
