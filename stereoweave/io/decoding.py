@@ -21,6 +21,7 @@ from stereoweave.errors import FormatError, Remedy, reason
 from stereoweave.io import exif, heif, raw
 from stereoweave.io.colour_profiles import make_profile
 from stereoweave.io.similar_names import as_typed, describe_missing
+from stereoweave.io.unreadable import check_readable
 from stereoweave.stereo import LONGEST_SIDE_PX
 
 # 50 megapixels per view are supported; cameras of that class have up to 64. The limit is checked against the
@@ -35,7 +36,7 @@ ENDINGS = heif.ENDINGS | {
 # JPS.
 _KINDS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "GIF", "PPM", "AVIF", "JPEG2000")
 _ANIMATIONS = ("GIF", "PNG", "WEBP", "AVIF")
-_VIDEO_ENDINGS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v", ".wmv")
+_VIDEO_ENDINGS = (".mp4", ".mov", ".mkv", ".mk3d", ".avi", ".webm", ".m4v", ".wmv")
 _AVIF_BRANDS = {b"avif", b"avis"}
 _MP_ENTRIES, _DISPARITY = 0xB002, "Multi-Frame Image: (Disparity)"
 _LONGEST_WORDS = 100
@@ -67,9 +68,15 @@ def open_picture(path: Path, *, views: int = 1, expected: str = A_PICTURE) -> It
         FormatError: The format or the size is unsupported. Damaged content is not detected before decoding.
     """
     check_regular(path, expected)
+    check_readable(path, expected)
     with _decoding(path, expected), path.open("rb") as file:
         brands = _find_brands(file.read(64))
     _refuse_by_name(path, brands)
+    if views == 2 and brands & _AVIF_BRANDS and heif.has_stereo_group(path):
+        raise FormatError(
+            f"{path}: expected {A_PICTURE}, found an AVIF file with a left and a right view, of which Pillow "
+            "reads one alone; save both as separate pictures, or as HEIC"
+        )
     with _decoding(path, expected):
         picture, sizes_px = _open_any(path, brands, views)
     with picture:
@@ -240,8 +247,7 @@ def _refuse_by_name(path: Path, brands: set[bytes]) -> None:
 
 def _refuse_by_content(path: Path, picture: Any, views: int) -> None:
     """Raise a FormatError for a panorama, a VR180 picture or an animation of more frames than views."""
-    description = picture.info.get("xmp", b"")
-    words = description if isinstance(description, bytes) else str(description).encode(errors="replace")
+    words = _read_xmp(picture)
     if b"GImage:" in words or b"equirectangular" in words.lower():
         raise FormatError(
             f"{path}: expected an ordinary picture, found a VR180 picture or a 360-degree panorama "
@@ -254,6 +260,19 @@ def _refuse_by_content(path: Path, picture: Any, views: int) -> None:
             f"{path}: expected {wanted}, found an animation of {count} frames; "
             "save its two views as separate pictures"
         )
+
+
+def holds_depth(picture: Any) -> bool:
+    """Return whether an open picture holds a depth map, as portraits of telephones do."""
+    words = _read_xmp(picture)
+    # Google's depth map metadata, and Dynamic Depth 1.0.
+    in_xmp = b"GDepth:" in words or b"http://ns.google.com/photos/dd/1.0/" in words
+    return in_xmp or bool(picture.info.get("depth_images"))
+
+
+def _read_xmp(picture: Any) -> bytes:
+    description = picture.info.get("xmp", b"")
+    return description if isinstance(description, bytes) else str(description).encode(errors="replace")
 
 
 def count_frames(path: Path) -> int:

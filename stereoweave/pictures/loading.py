@@ -17,6 +17,7 @@ from stereoweave.io.decoding import (
     check_size,
     decode,
     find_view_frames,
+    holds_depth,
     open_picture,
     read_embedded_picture,
     read_frame,
@@ -157,11 +158,12 @@ def _open_one(path: Path, format: str | None) -> Opened:
                 f"{path}: expected an MPO file with two pictures of the same size, found only one"
             )
         name, why = _read_declared(path, picture, format)
-        decoded = decode(path, picture)
+        decoded, has_depth = decode(path, picture), holds_depth(picture)
     lies = exif.read_orientation(decoded.tags)
     image = decoded.upright(lies)
     if name is None:
-        name, why = _detect_picture_layout(path, image), "detected from name and content"
+        name = _detect_picture_layout(path, image, has_depth=has_depth)
+        why = "detected from name and content"
     notes = [Note(f"{name}, {why}", _OVERRIDE)] if why else []
     layout = PAIR_LAYOUTS[name]
     left, right = _split_views(path, image, layout)
@@ -340,13 +342,21 @@ def _read_declared(path: Path, picture: Image.Image, format: str | None) -> tupl
     return next(name for name, each in PAIR_LAYOUTS.items() if each == known), "from its JPS header"
 
 
-def _detect_picture_layout(path: Path, image: UInt8[np.ndarray, "h w 3"]) -> str:
+def _detect_picture_layout(path: Path, image: UInt8[np.ndarray, "h w 3"], *, has_depth: bool) -> str:
     for kind, mark in _OTHER_LAYOUTS.items():
         if re.search(mark, path.stem):
             raise FormatError(
                 f"{path}: expected two views, found {kind}, judging by its name", remedy=_OVERRIDE
             )
-    return detect_layout(str(path), [image], photograph=True)
+    try:
+        return detect_layout(str(path), [image], photograph=True)
+    except FormatError as error:
+        if not has_depth:
+            raise
+        raise FormatError(
+            f"{path}: expected a stereo picture, found a photograph of one view with a depth map, as "
+            "portraits of telephones have; take a spatial photo, or give two files, left and right"
+        ) from error
 
 
 def _split_views(

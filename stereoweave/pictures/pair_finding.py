@@ -27,7 +27,7 @@ _ENDINGS = {
     "both views": (".mpo", ".jps", ".pns"),
     # Other programs use .raw for anything.
     "raw": tuple(raw.ENDINGS - {".raw"}),
-    "film": (".mp4", ".mkv", ".mov", ".avi", ".webm"),
+    "film": (".mp4", ".mkv", ".mk3d", ".mov", ".avi", ".webm"),
 }
 _SIDES = {"left": "right", "Left": "Right", "LEFT": "RIGHT", "l": "r", "L": "R", "im0": "im1"}
 _OTHER_SIDES = _SIDES | {right: left for left, right in _SIDES.items()}

@@ -17,6 +17,7 @@ from jaxtyping import UInt8
 from stereoweave.errors import FormatError, Note, Remedy, StereoweaveError, require_extra
 from stereoweave.io.decoding import ENDINGS
 from stereoweave.io.images import read_image
+from stereoweave.io.unreadable import check_readable
 from stereoweave.stereo import StereoCamera
 from stereoweave.video.colours import convert_to_rgb, name_hdr
 from stereoweave.video.spatial import RIGHT, Stereo3D, ViewPair, is_spatial, pair_views, read_stereo3d
@@ -364,6 +365,7 @@ def list_video_streams(path: Path) -> list[StreamFacts]:
 
 def open_container(path: Path) -> "av.container.InputContainer":
     """Open a video file. Raises FormatError."""
+    check_readable(path, "a video")
     with require_extra("video", f"{path}: reading video needs PyAV"):
         import av
     try:
