@@ -118,7 +118,7 @@ $(CORE)/installed: pyproject.toml constraints.txt
 
 $(DEV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(DEV)
-	$(DEV)/bin/python -m pip install --constraint constraints.txt --editable '.[synth,train,video,heic,app,cluster,mutate,dev]'
+	$(DEV)/bin/python -m pip install --constraint constraints.txt --editable '.[synth,train,video,heic,raw,app,cluster,mutate,dev]'
 	touch $@
 
 $(AUDIT)/installed: constraints.txt

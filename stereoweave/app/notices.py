@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from stereoweave.errors import NameOf, Note, format_error
-from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS
+from stereoweave.video.packings import FRAME_PACKINGS
 
 # The name of a layout, but not within a file's name. The form's fields show it with spaces.
-_LAYOUT = re.compile(rf"(?<![\w.-])({'|'.join(PAIR_LAYOUTS)})(?![\w.-])")
+_LAYOUT = re.compile(rf"(?<![\w.-])({'|'.join(FRAME_PACKINGS)})(?![\w.-])")
 
 
 class Wording:

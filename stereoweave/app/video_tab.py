@@ -14,7 +14,7 @@ from stereoweave.app.pair_form import MODELS, make_layout_choice, read_layout
 from stereoweave.app.video_upload import OUTPUTS, PREVIEW_S, ConvertedVideo, VideoUpload, convert_upload
 from stereoweave.errors import StereoweaveError
 from stereoweave.matching.backend import Backend
-from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS
+from stereoweave.video.packings import FRAME_PACKINGS
 
 _EMPTY = f"""<div class="empty"><ol>
 <li>Drop a stereo video: one file that holds both views, or a left and a right file.</li>
@@ -66,7 +66,7 @@ class VideoTab:
             elem_id="video-start",
         )
         with gr.Accordion("Layout and quality", open=False):
-            self._layout = make_layout_choice(_LABELS["format"], PAIR_LAYOUTS, "video-layout")
+            self._layout = make_layout_choice(_LABELS["format"], FRAME_PACKINGS, "video-layout")
             self._model = gr.Radio(MODELS[:2], value="small", label=_LABELS["model"], elem_id="video-model")
         self._preview = gr.Button(f"Preview {PREVIEW_S} seconds", variant="primary", elem_id="video-preview")
         self._whole = gr.Button("Convert the whole video", elem_id="video-whole")

@@ -34,7 +34,8 @@ Format = Annotated[
         "--format",
         help="Layout of a picture that holds both views: side_by_side, side_by_side_half, crossed, "
         "crossed_half, top_bottom, top_bottom_half, top_bottom_right_first, top_bottom_right_first_half, "
-        "mpo or jps (default: detected).",
+        "row_interleaved, column_interleaved, checkerboard, row_interleaved_right_first, "
+        "column_interleaved_right_first, checkerboard_right_first, mpo or jps (default: detected).",
     ),
 ]
 Projection = Annotated[

@@ -18,9 +18,10 @@ from jaxtyping import Shaped, UInt8
 from PIL import Image, UnidentifiedImageError, features
 
 from stereoweave.errors import FormatError, Remedy, reason
-from stereoweave.io import exif, heif, vr180
+from stereoweave.io import exif, heif, raw, vr180
 from stereoweave.io.colour_profiles import make_profile
 from stereoweave.io.similar_names import as_typed, describe_missing
+from stereoweave.io.unreadable import check_readable
 from stereoweave.stereo import LONGEST_SIDE_PX
 
 # 50 megapixels per view are supported; cameras of that class have up to 64. The limit is checked against the
@@ -35,11 +36,7 @@ ENDINGS = heif.ENDINGS | {
 # JPS.
 _KINDS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "GIF", "PPM", "AVIF", "JPEG2000")
 _ANIMATIONS = ("GIF", "PNG", "WEBP", "AVIF")
-_RAW_ENDINGS = {
-    *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dng", ".erf", ".iiq", ".kdc", ".mrw", ".nef", ".nrw", ".orf"),
-    *(".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw", ".x3f"),
-}
-_VIDEO_ENDINGS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v", ".wmv")
+_VIDEO_ENDINGS = (".mp4", ".mov", ".mkv", ".mk3d", ".avi", ".webm", ".m4v", ".wmv")
 _AVIF_BRANDS = {b"avif", b"avis"}
 _MP_ENTRIES, _DISPARITY = 0xB002, "Multi-Frame Image: (Disparity)"
 _LONGEST_WORDS = 100
@@ -75,15 +72,20 @@ def open_picture(
         FormatError: The format or the size is unsupported. Damaged content is not detected before decoding.
     """
     check_regular(path, expected)
+    check_readable(path, expected)
     with _decoding(path, expected), path.open("rb") as file:
         brands = _find_brands(file.read(64))
     _refuse_by_name(path, brands)
-    is_heif = not brands & _AVIF_BRANDS and bool(brands & heif.BRANDS)
+    if views == 2 and brands & _AVIF_BRANDS and heif.has_stereo_group(path):
+        raise FormatError(
+            f"{path}: expected {A_PICTURE}, found an AVIF file with a left and a right view, of which Pillow "
+            "reads one alone; save both as separate pictures, or as HEIC"
+        )
     with _decoding(path, expected):
-        picture = heif.open_heif(path) if is_heif else _open(path, path, views)
+        picture, sizes_px = _open_any(path, brands, views)
     with picture:
         # The sizes of all pictures: Pillow allocates memory when it seeks one.
-        for size_px in (picture.size, *(heif.read_sizes(path) if is_heif else ())):
+        for size_px in (picture.size, *sizes_px):
             check_size(path, size_px, views=views)
         _refuse_by_content(path, picture, views, panorama)
         yield picture
@@ -95,7 +97,15 @@ def read_picture(path: Path, *, panorama: bool = False) -> DecodedPicture:
         return decode(path, picture)
 
 
-def decode(path: Path, picture: Image.Image) -> DecodedPicture:
+def read_embedded_picture(name: str, content: bytes) -> DecodedPicture:
+    """Decode a picture with one view that is part of another file; error messages call it `name`."""
+    with _decoding(name):
+        picture = _open(name, io.BytesIO(content), 1)
+    check_size(name, picture.size)
+    return decode(name, picture)
+
+
+def decode(path: str | Path, picture: Image.Image) -> DecodedPicture:
     """Decode an open picture, or the current frame if it has several."""
     stated_px = picture.size
     with _decoding(path):
@@ -201,6 +211,16 @@ def _describe_other(path: str | Path) -> str:
     return "an empty file; copy it again" if is_empty else "another type of file; save it as PNG or JPEG"
 
 
+def _open_any(path: Path, brands: set[bytes], views: int) -> tuple[Image.Image, list[tuple[int, int]]]:
+    """Open a picture of any format; return it, and the sizes that it states beside its own."""
+    if path.suffix.lower() in raw.ENDINGS:
+        developed = raw.open_raw(path)
+        return developed, [developed.sensor_size_px]
+    if not brands & _AVIF_BRANDS and brands & heif.BRANDS:
+        return heif.open_heif(path), heif.read_sizes(path)
+    return _open(path, path, views), []
+
+
 def _open(path: str | Path, source: Path | io.BytesIO, views: int) -> Image.Image:
     try:
         return Image.open(source, formats=_KINDS)
@@ -226,16 +246,12 @@ def _find_brands(head: bytes) -> set[bytes]:
 def _refuse_by_name(path: Path, brands: set[bytes]) -> None:
     """Raise a FormatError for an unsupported format, detected from the file name or the brands."""
     ending = path.suffix.lower()
-    if ending in _RAW_ENDINGS:
-        raise FormatError(
-            f"{path}: expected {A_PICTURE}, found a camera raw file; convert it to one of these formats first"
-        )
     if brands & _AVIF_BRANDS:
         if not features.check("avif"):
             raise FormatError(
                 f"{path}: expected {A_PICTURE}, found AVIF, which the installed Pillow cannot read"
             )
-    elif not brands & heif.BRANDS and (brands or ending in _VIDEO_ENDINGS):
+    elif ending not in raw.ENDINGS and not brands & heif.BRANDS and (brands or ending in _VIDEO_ENDINGS):
         raise FormatError(
             f"{path}: expected {A_PICTURE}, found a video", remedy=Remedy("convert it as such", ("video",))
         )
@@ -258,6 +274,14 @@ def _refuse_by_content(path: Path, picture: Any, views: int, panorama: bool) -> 
         )
 
 
+def holds_depth(picture: Any) -> bool:
+    """Return whether an open picture holds a depth map, as portraits of telephones do."""
+    words = vr180.read_xmp(picture)
+    # Google's depth map metadata, and Dynamic Depth 1.0.
+    in_xmp = b"GDepth:" in words or b"http://ns.google.com/photos/dd/1.0/" in words
+    return in_xmp or bool(picture.info.get("depth_images"))
+
+
 def count_frames(path: Path) -> int:
     """Return the number of frames of an animation, or 1. Raises FormatError."""
     with _decoding(path), Image.open(path, formats=_KINDS) as picture:
@@ -272,7 +296,7 @@ def _count_frames(path: Path, picture: Any) -> int:
         return int(picture.n_frames)
 
 
-def _to_eight_bits(path: Path, picture: Image.Image) -> Image.Image:
+def _to_eight_bits(path: str | Path, picture: Image.Image) -> Image.Image:
     """Convert a loaded 16-bit grey picture, or a 32-bit one with 16-bit values, to 8-bit RGB."""
     with _decoding(path):
         values = np.asarray(picture)

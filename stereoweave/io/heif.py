@@ -88,6 +88,15 @@ def read_sizes(path: Path) -> list[tuple[int, int]]:
     return sizes_px
 
 
+def has_stereo_group(path: Path) -> bool:
+    """Return whether a file in boxes, HEIC or AVIF, names two of its pictures a left and a right view."""
+    try:
+        parts = dict(_split_boxes(_read_meta(path)[4:]))
+    except FormatError:
+        return False
+    return any(kind == _STEREO_GROUP.encode() for kind, _ in _split_boxes(parts.get(b"grpl", b"")))
+
+
 def find_views(picture: Any) -> list[int]:
     """Return the indices of the left and the right view; empty if the file holds one view.
 

@@ -7,7 +7,7 @@ from jaxtyping import Float32, UInt8
 # In red-cyan, green-magenta and amber-blue anaglyphs, one channel shows one view and the others the other.
 # In an anaglyph of a real pair (12 pairs, 4 kinds), the median share of moved windows is 0.42, in ordinary
 # photographs and in pairs side by side at most 0.10.
-_MOVED_SHARE, _FEW_WINDOWS = 0.2, 20
+MOVED_SHARE, _FEW_WINDOWS = 0.2, 20
 _LONGER_SIDE_PX, _DETAIL_PX = 320, 4
 _WINDOW_PX, _STEP_PX, _SHIFT_PX, _PLAIN = 24, 16, 24, 3.0
 # A window is moved if it correlates at least this well, and this much better than within 1 px of its place.
@@ -21,16 +21,17 @@ def looks_like_anaglyph(picture: UInt8[np.ndarray, "h w 3"]) -> bool:
     channels = list(cv2.resize(picture, size_px, interpolation=cv2.INTER_AREA).astype(np.float32).T)
     for index, channel in enumerate(channels):
         others = np.mean([other for at, other in enumerate(channels) if at != index], axis=0)
-        if _measure_moved_share(_extract_detail(channel.T), _extract_detail(others.T)) > _MOVED_SHARE:
+        if measure_moved_share(extract_detail(channel.T), extract_detail(others.T)) > MOVED_SHARE:
             return True
     return False
 
 
-def _extract_detail(shades: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+def extract_detail(shades: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+    """Return an image without its large areas of light and shade."""
     return shades - cv2.GaussianBlur(shades, (0, 0), _DETAIL_PX)
 
 
-def _measure_moved_share(here: Float32[np.ndarray, "h w"], there: Float32[np.ndarray, "h w"]) -> float:
+def measure_moved_share(here: Float32[np.ndarray, "h w"], there: Float32[np.ndarray, "h w"]) -> float:
     """Return the share of textured windows that lie elsewhere in the other image; 0 if they are too few."""
     height_px, width_px = here.shape
     moved = [

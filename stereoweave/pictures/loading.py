@@ -12,18 +12,21 @@ from PIL import Image
 
 from stereoweave.cameras.spherical import EQUIRECTANGULAR, HALF, RECTILINEAR, Projection, SphereRequest
 from stereoweave.errors import FormatError, Note, Remedy, StereoweaveError
-from stereoweave.io import exif, heif, vr180
+from stereoweave.io import exif, heif, lif, vr180
 from stereoweave.io.decoding import (
     DecodedPicture,
     check_size,
     decode,
     find_view_frames,
+    holds_depth,
     open_picture,
+    read_embedded_picture,
     read_frame,
     read_picture,
 )
 from stereoweave.io.images import check_large_enough, make_pair
 from stereoweave.pictures import panoramas
+from stereoweave.pictures.interleaved import InterleavedLayout
 from stereoweave.pictures.pair_layouts import (
     PAIR_LAYOUTS,
     PairLayout,
@@ -42,7 +45,7 @@ _OVERRIDE = Remedy("override it if it is wrong", ("format",))
 # other.
 _OTHER_LAYOUTS = {"a quilt of many views": r"_qs\d+x\d+a[\d.]+$", "a picture and its depth": r"_RGBD$"}
 
-_JPS_MARK, _JPS_STEREO, _JPS_BESIDE, _JPS_ABOVE = b"_JPSJPS_", 1, 2, 3
+_JPS_MARK, _JPS_STEREO, _JPS_INTERLEAVED, _JPS_BESIDE, _JPS_ABOVE = b"_JPSJPS_", 1, 1, 2, 3
 _JPS_HALF_HEIGHT, _JPS_HALF_WIDTH, _JPS_LEFT_FIRST = 1, 2, 4
 _CROSSED_ENDINGS = (".jps", ".pns")
 
@@ -54,7 +57,7 @@ class Opened:
     Attributes:
         pair: Both views, upright and in sRGB.
         layout: Layout of the files, which is a name in `PAIR_LAYOUTS`, "mpo" or "two_pictures" (also for a
-            HEIC file with two views and an animation of two frames).
+            HEIC or LIF file with two views and an animation of two frames).
         notes: Notes on what was detected or changed.
         lens: Camera parameters from the metadata, in pixels of the pair; None if there are none.
         projection: Projection of both images; None for ordinary ones.
@@ -123,10 +126,12 @@ def _advise_on_count(paths: Sequence[Path]) -> Remedy | None:
 def pixel_factor(path: Path, picture: Image.Image, format: str | None) -> int:
     """Return the ratio, 1 or 2, of the number of pixels in both views to the number in the file's header.
 
-    It is 2 for MPO and HEIC files with two views, for animations of two frames, and for half-size views
+    It is 2 for MPO, HEIC and LIF files with two views, for animations of two frames, and for half-size views
     declared by `format` or by the file's JPS header.
     """
-    if _find_frames(path, picture, format) or b"GImage:" in vr180.read_xmp(picture):
+    if format is None and (lif.is_lif(path) or b"GImage:" in vr180.read_xmp(picture)):
+        return 2
+    if _find_frames(path, picture, format):
         return 2
     known = PAIR_LAYOUTS.get(_read_declared(path, picture, format)[0] or "")
     return 2 if known is not None and known.half else 1
@@ -178,6 +183,9 @@ def _open_one(path: Path, format: str | None, sphere: SphereRequest) -> Opened:
         right_eye = None if format else panoramas.read_right_eye(path, picture, xmp)
         if right_eye:
             return _open_vr180(path, (decode(path, picture), right_eye), xmp, sphere)
+        views = lif.read_lif(path) if format is None else None
+        if views:
+            return _open_lif(path, picture, views)
         frames = _find_frames(path, picture, format)
         if frames and picture.format == "MPO":
             return _open_mpo(path, picture, frames)
@@ -190,11 +198,12 @@ def _open_one(path: Path, format: str | None, sphere: SphereRequest) -> Opened:
                 f"{path}: expected an MPO file with two pictures of the same size, found only one"
             )
         name, why = _read_declared(path, picture, format)
-        decoded = decode(path, picture)
+        decoded, has_depth = decode(path, picture), holds_depth(picture)
     lies = exif.read_orientation(decoded.tags)
     image = decoded.upright(lies)
     if name is None:
-        name, why = _detect_picture_layout(path, image), "detected from name and content"
+        name = _detect_picture_layout(path, image, has_depth=has_depth)
+        why = "detected from name and content"
     if vr180.is_panorama(xmp) or sphere.projection in (EQUIRECTANGULAR, HALF):
         # Angles are shares of width and height, whatever their ratio: enlarging would add no detail.
         name = name.removesuffix("_half")
@@ -286,6 +295,27 @@ def _open_heif(path: Path, picture: Image.Image, frames: Sequence[int]) -> Opene
     )
 
 
+def _open_lif(path: Path, picture: Image.Image, views: lif.LifViews) -> Opened:
+    """Open the pair in a LIF file, one view of which is the open picture."""
+    decoded = [
+        decode(path, picture)
+        if view.picture is None
+        else read_embedded_picture(f"{path}, {side} view", view.picture)
+        for side, view in (("left", views.left), ("right", views.right))
+    ]
+    lies, notes = _choose_orientations(*decoded)
+    eyes = [each.upright(lie) for each, lie in zip(decoded, lies, strict=True)]
+    which = "left and right view" if views.view_count == 2 else f"the outermost of {views.view_count} views"
+    pair = _pair_views(path, "a LIF", *eyes)
+    height_px, width_px = pair.left.shape[:2]
+    return Opened(
+        pair=pair,
+        layout=TWO_PICTURES,
+        notes=(Note(f"a LIF file, {which}", _OVERRIDE), *notes, *_note_colours(decoded)),
+        lens=_complete_lens(views.find_lens(width_px, height_px), _read_lens(decoded)),
+    )
+
+
 def _pair_views(
     path: Path, kind: str, left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h2 w2 3"]
 ) -> StereoPair:
@@ -298,7 +328,7 @@ def _pair_views(
 
 
 def _complete_lens(lens: exif.Lens | None, by_exif: exif.Lens | None) -> exif.Lens | None:
-    """Return a lens of a HEIC file, completed from EXIF."""
+    """Return a lens of a HEIC or LIF file, completed from EXIF."""
     if lens is None or by_exif is None:
         return lens or by_exif
     return replace(
@@ -379,10 +409,13 @@ def _read_declared(path: Path, picture: Image.Image, format: str | None) -> tupl
         is_jps = format == "jps" or path.suffix.lower() in _CROSSED_ENDINGS
         return ("crossed", "the default of .jps files") if is_jps else (None, None)
     flags, layout = mark[11], mark[12]
+    if layout == _JPS_INTERLEAVED:
+        name = "row_interleaved" if flags & _JPS_LEFT_FIRST else "row_interleaved_right_first"
+        return name, "from its JPS header"
     if layout not in (_JPS_BESIDE, _JPS_ABOVE):
         raise FormatError(
-            f"{path}: expected two views side by side or one above the other, found a JPS file that is "
-            "interleaved or an anaglyph; save it side by side"
+            f"{path}: expected two views side by side, one above the other or interleaved, found a JPS file "
+            "that is an anaglyph; save it side by side"
         )
     beside = layout == _JPS_BESIDE
     half = bool(flags & (_JPS_HALF_WIDTH if beside else _JPS_HALF_HEIGHT))
@@ -390,17 +423,25 @@ def _read_declared(path: Path, picture: Image.Image, format: str | None) -> tupl
     return next(name for name, each in PAIR_LAYOUTS.items() if each == known), "from its JPS header"
 
 
-def _detect_picture_layout(path: Path, image: UInt8[np.ndarray, "h w 3"]) -> str:
+def _detect_picture_layout(path: Path, image: UInt8[np.ndarray, "h w 3"], *, has_depth: bool) -> str:
     for kind, mark in _OTHER_LAYOUTS.items():
         if re.search(mark, path.stem):
             raise FormatError(
                 f"{path}: expected two views, found {kind}, judging by its name", remedy=_OVERRIDE
             )
-    return detect_layout(str(path), [image], photograph=True)
+    try:
+        return detect_layout(str(path), [image], photograph=True)
+    except FormatError as error:
+        if not has_depth:
+            raise
+        raise FormatError(
+            f"{path}: expected a stereo picture, found a photograph of one view with a depth map, as "
+            "portraits of telephones have; take a spatial photo, or give two files, left and right"
+        ) from error
 
 
 def _split_views(
-    path: Path, image: UInt8[np.ndarray, "h w 3"], layout: PairLayout
+    path: Path, image: UInt8[np.ndarray, "h w 3"], layout: PairLayout | InterleavedLayout
 ) -> tuple[UInt8[np.ndarray, "h2 w2 3"], UInt8[np.ndarray, "h2 w2 3"]]:
     """Split an image into the left and the right view, both at full size."""
     height_px, width_px = image.shape[:2]

@@ -13,6 +13,7 @@ from posixpath import splitext
 from typing import NamedTuple
 
 from stereoweave.errors import FormatError, Remedy, StereoweaveError
+from stereoweave.io import raw
 from stereoweave.io.decoding import ENDINGS
 from stereoweave.io.files import reading
 from stereoweave.io.stores import store_at
@@ -24,7 +25,9 @@ _ENDINGS = {
     # These are pairs even if there are pictures beside them, because cameras also write an .mpo file's left
     # view as .jpg.
     "both views": (".mpo", ".jps", ".pns"),
-    "film": (".mp4", ".mkv", ".mov", ".avi", ".webm"),
+    # Other programs use .raw for anything.
+    "raw": tuple(raw.ENDINGS - {".raw"}),
+    "film": (".mp4", ".mkv", ".mk3d", ".mov", ".avi", ".webm"),
 }
 _SIDES = {"left": "right", "Left": "Right", "LEFT": "RIGHT", "l": "r", "L": "R", "im0": "im1"}
 _OTHER_SIDES = _SIDES | {right: left for left, right in _SIDES.items()}
@@ -157,7 +160,8 @@ def find_pairs_among(folder: str | Path, paths: Iterable[str]) -> Listed:
 
     Two pictures are a pair if their paths differ only in their left/right marks: left/a.png and
     right/a.png, a_L.png and a_R.png, left_01.png and right_01.png, im0.png and im1.png. If one picture is
-    missing, the pair is still listed, and fails when it is read. A file with both views is also a pair.
+    missing, the pair is still listed, and fails when it is read. A file with both views is also a pair. A
+    camera raw file counts only if no picture beside it has its name.
     If there is no such pair or file, every picture is taken to hold both views. A calib.txt beside left.png
     or im0.png belongs to that pair. Output folders of batches are ignored.
 
@@ -170,8 +174,9 @@ def find_pairs_among(folder: str | Path, paths: Iterable[str]) -> Listed:
         StereoweaveError: Two pairs have the same name.
     """
     files = _group_by_kind(paths)
-    halves, doubles = _pair_by_marks(files["picture"]), files["both views"]
-    rest = sorted(set(files["picture"]).difference(chain.from_iterable(halves)))
+    pictures = [*files["picture"], *_find_undeveloped(files["raw"], files["picture"])]
+    halves, doubles = _pair_by_marks(pictures), files["both views"]
+    rest = sorted(set(pictures).difference(chain.from_iterable(halves)))
     if not (halves or doubles):
         doubles, rest = rest, []
     whole, calibrations = Path(os.path.abspath(folder)).name, set(files[_CALIBRATION])  # noqa: PTH100
@@ -282,6 +287,12 @@ def _group_by_kind(paths: Iterable[str]) -> dict[str, list[str]]:
             for kind, of in kinds.items()
         }
     return kinds
+
+
+def _find_undeveloped(raws: Sequence[str], pictures: Sequence[str]) -> list[str]:
+    """Return the raw files beside which the camera wrote no picture of the same name."""
+    names = {splitext(path)[0] for path in pictures}
+    return [path for path in raws if splitext(path)[0] not in names]
 
 
 def _list_parents(path: str) -> list[str]:

@@ -12,6 +12,11 @@ from jaxtyping import Float32, Num, UInt8
 from stereoweave.errors import FormatError, Note, Remedy
 from stereoweave.io.images import SMALLEST_SIDE_PX
 from stereoweave.pictures.anaglyphs import looks_like_anaglyph
+from stereoweave.pictures.interleaved import (
+    INTERLEAVED_LAYOUTS,
+    InterleavedLayout,
+    suspect_interleaving,
+)
 
 Picture = UInt8[np.ndarray, "h w 3"]
 Frame = UInt8[np.ndarray, "rows columns 3"]
@@ -23,6 +28,10 @@ class PairLayout(NamedTuple):
     beside: bool = True
     half: bool = False
     right_first: bool = False
+
+    def swapped(self) -> "PairLayout":
+        """Return the layout with the other view first."""
+        return self._replace(right_first=not self.right_first)
 
     def eye_size_px(self, width_px: int, height_px: int) -> tuple[int, int]:
         """Return the width and height of one view at full size.
@@ -67,7 +76,7 @@ class PairLayout(NamedTuple):
         return [Note(f"the last {line} is dropped, because the {size}, {extent_px} px, is odd")]
 
 
-PAIR_LAYOUTS = {
+_HALVES = {
     "side_by_side": PairLayout(),
     "side_by_side_half": PairLayout(half=True),
     "top_bottom": PairLayout(beside=False),
@@ -77,6 +86,7 @@ PAIR_LAYOUTS = {
     "top_bottom_right_first": PairLayout(beside=False, right_first=True),
     "top_bottom_right_first_half": PairLayout(beside=False, half=True, right_first=True),
 }
+PAIR_LAYOUTS: dict[str, PairLayout | InterleavedLayout] = {**_HALVES, **INTERLEAVED_LAYOUTS}
 
 _WORDS_IN_NAMES = {
     "side_by_side": {"lr", "lrf", "sbs", "hsbs", "fsbs", "halfsbs", "fullsbs", "parallel"},
@@ -127,8 +137,8 @@ def detect_layout(
     Args:
         name: Path of the file, whose name may contain a layout, such as film_SBS or film-half-OU.
         frames: Some frames of the video, far apart in time.
-        declared: Layout that the container declares, a full-size name in `PAIR_LAYOUTS`; the views may
-            nevertheless be half size.
+        declared: Layout that the container declares, a name in `PAIR_LAYOUTS` for views at full size, which
+            may nevertheless be half size, or for interleaved views.
         photograph: Whether the file is a still picture, not a video; its views may be in portrait format.
 
     Raises:
@@ -141,6 +151,8 @@ def detect_layout(
             f"that declares {declared}",
             remedy=Remedy(f"if that is wrong, choose one of {', '.join(PAIR_LAYOUTS)}", ("format",)),
         )
+    if declared in INTERLEAVED_LAYOUTS:
+        return str(declared)
     words = set(re.split(r"[^a-z0-9]+", Path(name).name.lower()))
     named = next((kind for kind, marks in _WORDS_IN_NAMES.items() if marks & words), None)
     kind = declared or _confirm(named, frames) or _detect_by_content(name, frames, photograph)
@@ -188,16 +200,25 @@ def _extract_detail(picture: Picture) -> Float32[np.ndarray, "120 160"]:
     return shades - cv2.GaussianBlur(shades, (0, 0), _WINDOW_PX / 5)
 
 
+def show_same_scene(pairs: Sequence[tuple[Picture, Picture]]) -> bool:
+    """Return whether both pictures of most pairs show the same scene, or all are too plain to tell."""
+    return not _score_pairs(pairs) < _ALIKE
+
+
 def _score_halves(kind: str, frames: Sequence[Frame]) -> float:
-    """Return the median resemblance of the frames' halves; NaN if all frames are too plain."""
-    scores = [measure_resemblance(*_split_halves(kind, frame)) for frame in frames]
+    return _score_pairs([_split_halves(kind, frame) for frame in frames])
+
+
+def _score_pairs(pairs: Sequence[tuple[Picture, Picture]]) -> float:
+    """Return the median resemblance of the pairs; NaN if all are too plain."""
+    scores = [measure_resemblance(*pair) for pair in pairs]
     known = [score for score in scores if not np.isnan(score)]
     return float(np.median(known)) if known else np.nan
 
 
 def _split_halves(kind: str, frame: Frame) -> tuple[Picture, Picture]:
     height_px, width_px = frame.shape[0] // 2, frame.shape[1] // 2
-    if PAIR_LAYOUTS[kind].beside:
+    if _HALVES[kind].beside:
         return frame[:, :width_px], frame[:, -width_px:]
     return frame[:height_px], frame[-height_px:]
 
@@ -218,6 +239,8 @@ def _detect_by_content(name: str, frames: Sequence[Frame], photograph: bool) -> 
         return best
     if np.isnan(alike[best]):
         found = "a picture that is too plain to tell; give two files, left and right"
+    elif woven := suspect_interleaving(frames[len(frames) // 2]):
+        found = f"what looks like {woven}, or a frame of interlaced video in motion"
     elif not photograph:
         found = "halves that do not resemble each other; give two files, left and right"
     elif looks_like_anaglyph(frames[0]):
@@ -236,14 +259,14 @@ def _detect_by_content(name: str, frames: Sequence[Frame], photograph: bool) -> 
 
 def _looks_squeezed(kind: str, frame: Frame) -> bool:
     height_px, width_px = frame.shape[:2]
-    if PAIR_LAYOUTS[kind].beside:
+    if _HALVES[kind].beside:
         return width_px / 2 < _NARROWEST_EYE * height_px
     return width_px > _WIDEST_EYE * height_px / 2
 
 
 def _looks_squeezed_photograph(kind: str, frame: Frame) -> bool:
     height_px, width_px = frame.shape[:2]
-    if PAIR_LAYOUTS[kind].beside:
+    if _HALVES[kind].beside:
         aspect = width_px / 2 / height_px
         # A picture with a screen's aspect ratio is made for a 3-D screen, which stretches half-width views.
         if abs(width_px / height_px / _SCREEN - 1) < _SCREEN_TOLERANCE:

@@ -17,7 +17,11 @@ from stereoweave.cameras.spherical import FISHEYE, RECTILINEAR, SphereRequest
 from stereoweave.errors import FormatError, Note, Remedy, StereoweaveError
 from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS, detect_layout
 from stereoweave.pictures.panoramas import SphereView, guess_projection
-from stereoweave.video.tracks import Shot, Track, VideoTrack, open_track
+from stereoweave.video.frame_sequence import FrameSequence
+from stereoweave.video.mvc import check_not_mvc
+from stereoweave.video.packings import FRAME_PACKINGS, FRAME_SEQUENTIAL, TWO_STREAMS
+from stereoweave.video.tracks import Shot, Track, VideoTrack, list_picture_files, open_track
+from stereoweave.video.twin_streams import open_twins
 
 # A spatial video is refused if none of this many images is followed by its second view.
 _MOST_ALONE = 300
@@ -31,6 +35,7 @@ _RETIMED = "its timestamp was missing or a duplicate, so it is shown slightly la
 
 
 FinePair = tuple[np.ndarray, np.ndarray]
+_Source = Track | FrameSequence
 
 
 class StereoFrame(NamedTuple):
@@ -62,7 +67,7 @@ class StereoVideo:
 
     Attributes:
         name: Paths of the files, as given by the caller.
-        frame_packing: Frame packing, a name in `PAIR_LAYOUTS`; None for two files, and for a spatial video.
+        frame_packing: Frame packing, a name in `FRAME_PACKINGS`; None for two files, and for a spatial video.
         size_px: Width and height of each eye's image at full size.
         frame_count: Number of frames that `frames` yields, including damaged frames. For two files with
             different numbers of frames, this is the lower number.
@@ -81,19 +86,21 @@ class StereoVideo:
         on_frame: Function that `frames` calls with the number of each frame that it yields, to show progress.
     """
 
-    def __init__(self, tracks: Sequence[Track], frame_packing: str | None) -> None:
+    def __init__(
+        self, tracks: Sequence[_Source], frame_packing: str | None, notes: Sequence[Note] = ()
+    ) -> None:
         """Combine a left and a right track, or split one track with both eyes in each frame.
 
-        Without a frame packing, a single track must be spatial.
+        Without a frame packing in `PAIR_LAYOUTS`, a single track must be spatial or a `FrameSequence`.
         """
         self._tracks = tracks
-        self._split = PAIR_LAYOUTS[frame_packing] if frame_packing else None
+        self._split = PAIR_LAYOUTS.get(frame_packing or "")
         first = tracks[0]
         self.name = ", ".join(track.name for track in tracks)
         self.frame_packing = frame_packing
         self.size_px = self._split.eye_size_px(*first.size_px) if self._split else first.size_px
         odd = self._split.note_odd_size(*first.size_px) if self._split else []
-        self.notes = (*first.notes, *odd)
+        self.notes = (*notes, *first.notes, *odd)
         self.camera = first.camera
         if self._split and isinstance(first, VideoTrack):
             self.camera = first.packed_camera(self.size_px)
@@ -185,7 +192,7 @@ class StereoVideo:
             found += [ending for track in self._tracks if (ending := self._describe_ending(track))]
         return "; ".join(found) or None
 
-    def _describe_ending(self, track: Track) -> str | None:
+    def _describe_ending(self, track: _Source) -> str | None:
         more = len(track.steps) - (self._last + 1)
         frames = "1 more frame" if more == 1 else f"{more} more frames"
         return f"{track.name} has {frames} than the other video" if more else track.truncation
@@ -205,8 +212,8 @@ def open_video(
 
     Args:
         paths: One or two videos, folders of pictures, or glob patterns that match pictures.
-        format: Frame packing of a single video, a name in `PAIR_LAYOUTS`; none for a spatial video. Default:
-            detected.
+        format: Frame packing of a single video, a name in `FRAME_PACKINGS`; none for a spatial video.
+            Default: detected.
         rate: Frame rate for pictures, in frames per second. Default: 25.
         sphere: Projection of the video, and the window to show. Default: detected, straight ahead.
 
@@ -216,35 +223,46 @@ def open_video(
         StereoweaveError: The frame packing is unknown, the number of paths is not one or two, a rate is given
             for a video, or PyAV is missing.
     """
-    if format not in (None, *PAIR_LAYOUTS):
+    if format not in (None, *FRAME_PACKINGS):
         raise StereoweaveError(
-            f"expected one of {', '.join(PAIR_LAYOUTS)}, found {format!r}", setting="format"
+            f"expected one of {', '.join(FRAME_PACKINGS)}, found {format!r}", setting="format"
         )
     if not 1 <= len(paths) <= 2 or (len(paths) == 2 and format):
         raise StereoweaveError(
             "expected one video with both eyes, or a left and a right video without a frame packing, "
             f"found {len(paths)}: {' '.join(map(str, paths))}"
         )
-    tracks = [open_track(path, rate) for path in paths]
-    return _show_window(_combine(tracks, format, sphere or SphereRequest()), sphere or SphereRequest())
+    sphere = sphere or SphereRequest()
+    if len(paths) == 1:
+        return _show_window(_open_single(paths[0], format, rate, sphere), sphere)
+    left, right = (open_track(path, rate) for path in paths)
+    _check_alike(left, right)
+    return _show_window(StereoVideo([left, right], None), sphere)
 
 
-def _combine(tracks: Sequence[Track], format: str | None, sphere: SphereRequest) -> StereoVideo:
-    """Combine two tracks, or open the only one."""
-    if len(tracks) == 2:
-        _check_alike(*tracks)
-        return StereoVideo(tracks, None)
-    [track] = tracks
+def _open_single(path: Path, format: str | None, rate: Fraction | None, sphere: SphereRequest) -> StereoVideo:
+    """Open a video with both eyes."""
+    if rate is None and list_picture_files(path) is None:
+        check_not_mvc(path)
+        twins = open_twins(path, format) if format in (None, *TWO_STREAMS) else None
+        if twins:
+            _check_alike(*twins.tracks)
+            video = StereoVideo(twins.tracks, twins.packing, [twins.note])
+            video.name = str(path)
+            return video
+    track = open_track(path, rate)
     if isinstance(track, VideoTrack) and track.is_spatial:
         check_unpacked(track.name, format)
         _check_second_view(track)
-        return StereoVideo(tracks, None)
+        return StereoVideo([track], None)
+    if (format or track.declared_packing) in FRAME_SEQUENTIAL:
+        return _open_sequence(track, format)
     name = format or detect_layout(track.name, track.samples(), track.declared_packing)
     if track.sphere or sphere.projection not in (None, RECTILINEAR, FISHEYE):
         # Angles are shares of width and height, whatever their ratio: enlarging would add no detail.
         name = name.removesuffix("_half")
     try:
-        return StereoVideo(tracks, name)
+        return StereoVideo([track], name)
     except FormatError as error:
         raise FormatError(f"{track.name}: {error}") from error
 
@@ -260,6 +278,14 @@ def _show_window(video: StereoVideo, request: SphereRequest) -> StereoVideo:
     view = SphereView.chosen(projection, video.size_px, request)
     note = view.note(request, ", detected from the name" if by_name else "")
     return video.show(view, declared.baseline_m if declared else None, note)
+
+
+def _open_sequence(track: Track, format: str | None) -> StereoVideo:
+    """Open a video whose left and right frames alternate, as `format` says or the file declares."""
+    name = format or str(track.declared_packing)
+    declared = Note(f"{name}, as the file declares", Remedy("override it if it is wrong", ("format",)))
+    frames = FrameSequence(track, right_first=FRAME_SEQUENTIAL[name])
+    return StereoVideo([frames], name, [] if format else [declared])
 
 
 def check_unpacked(name: str, format: str | None) -> None:
@@ -308,7 +334,7 @@ def _check_alike(left: Track, right: Track) -> None:
         )
 
 
-def _bridge_gaps(track: Track, start: int, first: int) -> Iterator[tuple[Shot, str | None]]:
+def _bridge_gaps(track: _Source, start: int, first: int) -> Iterator[tuple[Shot, str | None]]:
     """Yield a shot and its problem, if any, for each frame from number `start` on; replace missing frames.
 
     Decoding begins at a key frame at or before frame `first`.

@@ -21,7 +21,7 @@ _UNNAMED = 28, _VIEW_ID, 30, 31
 # AVStereo3D: nine numbers of 4 bytes, to which later versions of FFmpeg may add.
 _STEREO3D_BYTES = 36
 # AVStereo3DView and AVSphericalProjection.
-_RIGHT, _UNSPECIFIED_VIEWS = 2, (0, 3)
+RIGHT, _UNSPECIFIED_VIEWS = 2, (0, 3)
 _RECTILINEAR = 4
 # Wider pictures are no perspective views; no lens is so narrow.
 _NARROWEST_DEG, _WIDEST_DEG = 1.0, 150.0
@@ -50,7 +50,7 @@ class Stereo3D:
     @property
     def is_right_first(self) -> bool:
         """Whether the base view of a spatial video is the right one. If the file does not say, it is not."""
-        return self.view == _RIGHT or (self.view in _UNSPECIFIED_VIEWS and self.is_inverted)
+        return self.view == RIGHT or (self.view in _UNSPECIFIED_VIEWS and self.is_inverted)
 
     def camera(self, size_px: tuple[int, int]) -> StereoCamera | None:
         """Return the camera of views of this width and height; None unless all of it is known."""

@@ -22,11 +22,11 @@ from stereoweave.io.colormap import find_colour_range_px
 from stereoweave.io.images import SMALLEST_SIDE_PX
 from stereoweave.matching.estimate import match
 from stereoweave.matching.matcher import Matcher
-from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS
 from stereoweave.rendering.layouts import median_disparity_px
 from stereoweave.rendering.scaling import fit_size
 from stereoweave.stereo import StereoPair
 from stereoweave.system.threads import thread_count
+from stereoweave.video.packings import find_swapped_packing
 from stereoweave.video.reader import StereoFrame, StereoVideo, format_time
 
 _SURVEYED_FRAMES, _CHECKED_FRAMES = 24, 3
@@ -205,7 +205,7 @@ def _spread_evenly(count: int, wanted: int) -> range:
 
 def _name_packing(note: Note, video: StereoVideo) -> Note:
     """Return a note; if the views in a single file are swapped, its remedy names the other frame packing."""
-    other = _find_swapped_packing(video.frame_packing)
+    other = find_swapped_packing(video.frame_packing)
     if note == SWAPPED and other:
         return replace(note, remedy=Remedy(f"choose {other}", ("format",)))
     return note
@@ -223,12 +223,3 @@ def _select_common_notes(defects: Sequence[list[Note]]) -> list[Note]:
         return []
     where = "" if len(some) == len(defects) else "in most of the video: "
     return [replace(note, text=where + note.text) for note in some[-1]]
-
-
-def _find_swapped_packing(frame_packing: str | None) -> str | None:
-    """Return the name of the frame packing with the eyes swapped, or None if no such packing exists."""
-    if frame_packing is None:
-        return None
-    split = PAIR_LAYOUTS[frame_packing]
-    other = split._replace(right_first=not split.right_first)
-    return next((name for name, known in PAIR_LAYOUTS.items() if known == other), None)

@@ -4,7 +4,7 @@ import re
 from array import array
 from bisect import bisect_left
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from fractions import Fraction
 from functools import partial
 from itertools import count, dropwhile, islice, pairwise
@@ -17,9 +17,10 @@ from jaxtyping import Float32, UInt8
 from stereoweave.errors import FormatError, Note, Remedy, StereoweaveError, require_extra
 from stereoweave.io.decoding import ENDINGS
 from stereoweave.io.images import read_image
+from stereoweave.io.unreadable import check_readable
 from stereoweave.stereo import StereoCamera
 from stereoweave.video.colours import convert_to_fine, convert_to_rgb, hdr_colours, name_hdr
-from stereoweave.video.spatial import Stereo3D, ViewPair, is_spatial, pair_views, read_stereo3d
+from stereoweave.video.spatial import RIGHT, Stereo3D, ViewPair, is_spatial, pair_views, read_stereo3d
 from stereoweave.video.sphere_marks import SphereMark, read_sphere
 
 if TYPE_CHECKING:
@@ -31,20 +32,39 @@ _SAMPLES = 0.1, 0.3, 0.5, 0.7, 0.9
 _STEREO_3D = {
     1: "side_by_side",
     2: "top_bottom",
-    3: "frame_sequence",
+    3: "frame_sequential",
     4: "checkerboard",
     5: "side_by_side_quincunx",
-    6: "lines",
-    7: "columns",
+    6: "row_interleaved",
+    7: "column_interleaved",
 }
 
 # Type of the first box in an MP4 or MOV file, which follows the four bytes of the box's length.
 _MP4_BOXES = b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot"
 
+# FFmpeg's AV_DISPOSITION_ATTACHED_PIC and AV_DISPOSITION_TIMED_THUMBNAILS.
+_SINGLE_PICTURES = 0x400 | 0x800
+
 # A file counts as cut off if it ends before its declared duration by more than this.
 _CUT_OFF_S = Fraction(1, 5)
 
 Decoded = TypeVar("Decoded", "av.VideoFrame", ViewPair)
+
+
+class StreamFacts(NamedTuple):
+    """What a file says about one of its video streams.
+
+    Attributes:
+        number: Index of the stream among all streams of the file.
+        size_px: Width and height of its frames.
+        rate: Frames per second.
+        plane: FFmpeg's tag `stereo_mode`, such as "left_2"; "" if there is none.
+    """
+
+    number: int
+    size_px: tuple[int, int]
+    rate: Fraction
+    plane: str
 
 
 class Shot(NamedTuple):
@@ -65,18 +85,18 @@ class Shot(NamedTuple):
 
 
 class VideoTrack:
-    """Frames of one video file.
+    """Frames of one video file, of the stream that FFmpeg finds best or of the one with this index.
 
     Attributes:
-        name: Path as given by the caller.
+        name: Path as given by the caller, with the index of the stream if it is given.
         steps: Display time of each frame, strictly increasing, in units of `time_base`.
         retimed: Indices of the frames that are shown later because their timestamp was missing or a
             duplicate.
         time_base: Time unit in seconds.
         rate: Average frames per second.
         size_px: Width and height of a whole frame after the rotation that players apply.
-        declared_packing: Frame packing declared in the file, either a full-size packing in `PAIR_LAYOUTS` or
-            an unsupported packing; None if the file declares no packing, or is a spatial video.
+        declared_packing: Frame packing declared in the file, a packing in `PAIR_LAYOUTS` other than of half
+            size, or an unsupported packing; None if the file declares no packing, or is a spatial video.
         is_spatial: Whether the video is a spatial one (MV-HEVC), with each view in a layer of its own.
         camera: Camera of the views of a spatial video, if the file declares it and rotates no views.
         sphere: Projection of a VR180 or 360-degree video, if the file declares one.
@@ -89,17 +109,20 @@ class VideoTrack:
         FormatError: The file does not exist, is not a video, or has no frame that can be decoded.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.name = str(path)
-        self._path = path
-        with _opening(path) as (container, stream):
+    def __init__(self, path: Path, stream_index: int | None = None) -> None:
+        self.name = str(path) if stream_index is None else f"{path}, stream {stream_index}"
+        self._path, self._index = path, stream_index
+        with self._opening() as (container, stream):
             self.sound = path if container.streams.audio else None
             self._read_times(container, stream)
-        with _opening(path) as (container, stream):
+        with self._opening() as (container, stream):
             first = next(_drop_corrupt(_decode(container, stream)), None)
             if first is None:
-                raise FormatError(f"{path}: expected a video, found a file without a decodable frame")
+                raise FormatError(f"{self.name}: expected a video, found a file without a decodable frame")
             self._describe(first, stream.codec_context.name)
+
+    def _opening(self) -> AbstractContextManager[tuple["av.container.InputContainer", "av.VideoStream"]]:
+        return _opening(self._path, self._index)
 
     def _describe(self, first: "av.VideoFrame", codec: str) -> None:
         """Set what the first frame says about all frames."""
@@ -129,7 +152,7 @@ class VideoTrack:
         `start` is ignored. The artefacts that follow a damaged frame depend on all frames before it, so only
         decoding from the same key frame yields the same frames in every run.
         """
-        with _opening(self._path) as (container, stream):
+        with self._opening() as (container, stream):
             if first and self._stamps is not None:
                 shots = self._read_after_seek(container, stream, first)
                 opening = next(shots, None)
@@ -137,12 +160,12 @@ class VideoTrack:
                     yield opening
                     yield from shots
                     return
-        with _opening(self._path) as (container, stream):
+        with self._opening() as (container, stream):
             yield from self._read_shots(container, stream)
 
     def can_begin(self, most: int) -> bool:
         """Return whether the first decoded images, at most this many, hold a frame with all its views."""
-        with _opening(self._path) as (container, stream):
+        with self._opening() as (container, stream):
             return next(self._read_shots(container, stream, most), None) is not None
 
     def _read_after_seek(
@@ -198,7 +221,7 @@ class VideoTrack:
         import av
 
         pictures: list[UInt8[np.ndarray, "h w 3"]] = []
-        with _opening(self._path) as (container, stream):
+        with self._opening() as (container, stream):
             pictures += map(convert_to_rgb, islice(_drop_corrupt(_decode(container, stream)), 1))
             for share in _SAMPLES:
                 with suppress(av.error.FFmpegError):
@@ -340,16 +363,46 @@ def list_picture_files(path: Path) -> list[Path] | None:
     return sorted(filter(_is_picture, found), key=_natural_key)
 
 
-@contextmanager
-def _opening(path: Path) -> Iterator[tuple["av.container.InputContainer", "av.VideoStream"]]:
+def list_video_streams(path: Path) -> list[StreamFacts]:
+    """Return the video streams of a file, without those that hold a cover or nothing.
+
+    Raises:
+        FormatError: The file cannot be opened.
+    """
+    with open_container(path) as container:
+        return [
+            StreamFacts(
+                number=stream.index,
+                size_px=(stream.codec_context.width, stream.codec_context.height),
+                rate=stream.guessed_rate or Fraction(25),
+                plane=stream.metadata.get("stereo_mode", ""),
+            )
+            for stream in container.streams.video
+            if stream.codec_context is not None
+            and stream.codec_context.width * stream.codec_context.height > 0
+            and not stream.disposition & _SINGLE_PICTURES
+        ]
+
+
+def open_container(path: Path) -> "av.container.InputContainer":
+    """Open a video file. Raises FormatError."""
+    check_readable(path, "a video")
     with require_extra("video", f"{path}: reading video needs PyAV"):
         import av
     try:
-        container = av.open(str(path), metadata_errors="replace")
+        return av.open(str(path), metadata_errors="replace")
     except av.error.FFmpegError as error:
         raise FormatError(f"{path}: expected a video, found {_describe_unopened(path, error)}") from error
-    with container:
-        stream = container.streams.best("video")
+
+
+@contextmanager
+def _opening(
+    path: Path, index: int | None = None
+) -> Iterator[tuple["av.container.InputContainer", "av.VideoStream"]]:
+    with open_container(path) as container:
+        import av
+
+        stream = container.streams.best("video") if index is None else container.streams[index]
         if not isinstance(stream, av.VideoStream) or stream.codec_context is None:
             raise FormatError(f"{path}: expected a video, found a file without a decodable video track")
         # With several threads, FFmpeg conceals damage in H.264 poorly, if at all, and not reproducibly.
@@ -493,7 +546,9 @@ def _convert_all_fine(views: Sequence["av.VideoFrame"]) -> list[Float32[np.ndarr
 def _name_packing(declared: Stereo3D) -> str | None:
     name = _STEREO_3D.get(declared.kind)
     right_first = {None: None, "side_by_side": "crossed"}
-    return right_first.get(name, f"{name}_right_first") if declared.is_inverted else name
+    # Of a frame sequence, each H.264 frame says which view it is; the caller gives the first one.
+    is_inverted = declared.is_inverted != (name == "frame_sequential" and declared.view == RIGHT)
+    return right_first.get(name, f"{name}_right_first") if is_inverted else name
 
 
 def _choose_rate(steps: Sequence[int], time_base: Fraction, average: Fraction) -> Fraction:

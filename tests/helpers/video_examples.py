@@ -56,7 +56,24 @@ def packed(left: np.ndarray, right: np.ndarray, layout: str = "side_by_side") ->
             return np.vstack([shrunk(eye, width_px, height_px // 2) for eye in (left, right)])
         case "crossed_half" | "top_bottom_right_first_half":
             return packed(right, left, "side_by_side_half" if "crossed" in layout else "top_bottom_half")
+        case "row_interleaved" | "column_interleaved" | "checkerboard":
+            return interleaved(left, right, layout)
+        case _ if layout.endswith("_right_first"):
+            return packed(right, left, layout.removesuffix("_right_first"))
     raise ValueError(layout)
+
+
+def interleaved(first: np.ndarray, second: np.ndarray, layout: str) -> np.ndarray:
+    """Return an image whose rows, columns or fields of a checkerboard come from both in turn."""
+    both = first.copy()
+    if layout == "column_interleaved":
+        both[:, 1::2] = second[:, 1::2]
+    elif layout == "row_interleaved":
+        both[1::2] = second[1::2]
+    else:
+        both[::2, 1::2] = second[::2, 1::2]
+        both[1::2, ::2] = second[1::2, ::2]
+    return both
 
 
 def shrunk(image: np.ndarray, width_px: int, height_px: int) -> np.ndarray:

@@ -16,6 +16,7 @@ from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io.exif import Lens
 from stereoweave.io.images import read_image, write_image
 from stereoweave.pictures.anaglyphs import looks_like_anaglyph
+from stereoweave.pictures.interleaved import INTERLEAVED_LAYOUTS
 from stereoweave.pictures.loading import FORMATS, open_pictures, pixel_factor
 from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS
 from stereoweave.rendering.layouts import LAYOUTS, LayoutOptions, add_mark, write_picture
@@ -340,10 +341,20 @@ def test_a_jps_file_that_says_nothing_is_crossed(tmp_path, pair):
     assert open_pictures([tmp_path / "b.jpg"], "jps").layout == "crossed"
 
 
-@pytest.mark.parametrize("layout", [1, 4])
-def test_a_jps_file_that_is_interleaved_or_an_anaglyph_is_refused(tmp_path, pair, layout):
-    path = write_jps(tmp_path / "a.jps", pair.left, flags=4, layout=layout)
-    assert "interleaved or an anaglyph" in refusal(path)
+def test_a_jps_file_that_is_an_anaglyph_is_refused(tmp_path, pair):
+    path = write_jps(tmp_path / "a.jps", pair.left, flags=4, layout=4)
+    assert "that is an anaglyph; save it side by side" in refusal(path)
+
+
+@pytest.mark.parametrize(("flags", "layout"), [(4, "row_interleaved"), (0, "row_interleaved_right_first")])
+def test_a_jps_file_that_is_interleaved_says_which_view_has_the_first_row(tmp_path, flags, layout):
+    grey = {"row_interleaved": (60, 180), "row_interleaved_right_first": (180, 60)}[layout]
+    rows = np.where(np.arange(80)[:, None, None] % 2 == 0, *grey).astype(np.uint8)
+    path = write_jps(tmp_path / "a.jps", np.tile(rows, (1, 96, 3)), flags, layout=1)
+    opened = open_pictures([path])
+    assert opened.layout == layout
+    assert abs(opened.pair.left.mean() - 60) < 2
+    assert abs(opened.pair.right.mean() - 180) < 2
 
 
 # One file: seen or named
@@ -394,7 +405,7 @@ def test_a_guess_is_told_and_how_to_overrule_it(tmp_path, pair):
     assert open_pictures([tmp_path / "view.png"], "side_by_side").notes == ()
 
 
-@pytest.mark.parametrize("format", PAIR_LAYOUTS)
+@pytest.mark.parametrize("format", [*PAIR_LAYOUTS.keys() - INTERLEAVED_LAYOUTS.keys()])
 def test_a_named_format_is_taken_without_a_look(tmp_path, rng, format):
     noise = rng.integers(0, 256, (80, 100, 3), dtype=np.uint8)
     write_image(tmp_path / "view.png", noise)
@@ -433,7 +444,7 @@ def test_an_anaglyph_is_named(tmp_path, pair, kind, order):
     assert (
         "found an anaglyph, which mixes both views into one picture; give the two pictures it was" in message
     )
-    assert message.endswith("top_bottom_right_first, top_bottom_right_first_half (format)")
+    assert message.endswith("column_interleaved_right_first, checkerboard_right_first (format)")
 
 
 @pytest.mark.parametrize("photograph", ["astronaut", "coffee", "chelsea", "rocket", "retina", "colorwheel"])

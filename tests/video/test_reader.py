@@ -1,3 +1,4 @@
+import re
 import sys
 from array import array
 from fractions import Fraction
@@ -123,11 +124,16 @@ def test_the_frame_packing_that_h264_frames_declare_is_used(tmp_path):
 
 
 def test_an_unsupported_declared_frame_packing_is_named(tmp_path):
-    path = write_side_by_side(
-        tmp_path / "video.mkv", flat_pairs(2), stereo_mode="row_interleaved_lr", codec="ffv1"
-    )
-    assert "video.mkv: " in refusal(path)
-    assert "declares lines; if that is wrong, choose one of side_by_side, " in refusal(path)
+    options = {"x264-params": "frame-packing=3"}
+    path = write_side_by_side(tmp_path / "video.mp4", flat_pairs(2), codec="libx264", options=options)
+    # The message's kind and length; identifier 0, no cancelling, side by side; then a bit for quincunx.
+    found = re.compile(rb"(\x2d.\x81)\x81", re.DOTALL)
+    changed, count = found.subn(lambda match: match[1] + b"\xc1", path.read_bytes())
+    assert count
+    path.write_bytes(changed)
+    assert "video.mp4: " in refusal(path)
+    declared = "declares side_by_side_quincunx; if that is wrong, choose one of side_by_side, "
+    assert declared in refusal(path)
     assert open_video([path], "side_by_side").frame_count == 2
 
 
@@ -557,3 +563,17 @@ def test_each_frame_that_is_read_is_counted(tmp_path):
     list(video.frames())
     list(video.excerpt(0.08, 0.08).frames())
     assert read == [0, 1, 2, 3, 4, 5, 0, 1]
+
+
+def test_interleaved_rows_that_the_container_declares_are_read(tmp_path):
+    pairs = flat_pairs(2, height=72)
+    for mode, format in (
+        ("row_interleaved_lr", "row_interleaved"),
+        ("col_interleaved_rl", "column_interleaved_right_first"),
+        ("checkerboard_rl", "checkerboard_right_first"),
+    ):
+        path = tmp_path / f"{mode}.mkv"
+        write_side_by_side(path, pairs, layout=format, stereo_mode=mode, codec="ffv1")
+        video = open_video([path])
+        assert video.frame_packing == format
+        assert_eyes(video.frames(), pairs)

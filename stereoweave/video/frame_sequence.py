@@ -1,0 +1,64 @@
+"""Reading of frame-sequential videos, in which left and right frames alternate."""
+
+from collections.abc import Iterable, Iterator
+from functools import partial
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from stereoweave.errors import FormatError, Note
+from stereoweave.stereo import StereoCamera
+from stereoweave.video.tracks import Shot, Track
+
+
+class FrameSequence:
+    """Pairs of successive frames of a track, with the attributes of a `VideoTrack` that reading needs.
+
+    A pair has the time of its first frame. Of an odd number of frames, the last one is dropped.
+
+    Raises:
+        FormatError: The track has only one frame.
+    """
+
+    camera: StereoCamera | None = None
+
+    def __init__(self, track: Track, *, right_first: bool) -> None:
+        count = len(track.steps) // 2
+        if not count:
+            raise FormatError(
+                f"{track.name}: expected left and right frames in turn, found a video of one frame"
+            )
+        self.name, self._track, self._right_first = track.name, track, right_first
+        self.steps = track.steps[: 2 * count : 2]
+        self.retimed = {index // 2 for index in track.retimed if index % 2 == 0}
+        self.time_base, self.rate = track.time_base, track.rate / 2
+        self.size_px, self.sound, self.truncation = track.size_px, track.sound, track.truncation
+        self.sphere, self.hdr_colours = track.sphere, track.hdr_colours
+        odd = [Note("the last frame is dropped, because no second view follows it")]
+        self.notes = [*track.notes, *(odd if len(track.steps) % 2 else [])]
+
+    def shots(self, start: int, first: int = 0) -> Iterator[Shot]:
+        """Yield the pairs of which both frames can be decoded; see `VideoTrack.shots`."""
+        return _pair_shots(self._track.shots(2 * start, 2 * first), right_first=self._right_first)
+
+
+def _pair_shots(shots: Iterable[Shot], *, right_first: bool) -> Iterator[Shot]:
+    waiting = None
+    for shot in shots:
+        if waiting is not None and shot.number % 2 and shot.number == waiting.number + 1:
+            both = (shot, waiting) if right_first else (waiting, shot)
+            yield Shot(
+                number=shot.number // 2,
+                pictures=partial(_convert_both, *both),
+                is_key_frame=waiting.is_key_frame,
+                fine_pictures=partial(_convert_both_fine, *both),
+            )
+        waiting = shot
+
+
+def _convert_both(left: Shot, right: Shot) -> list[UInt8[np.ndarray, "h w 3"]]:
+    return [*left.pictures(), *right.pictures()]
+
+
+def _convert_both_fine(left: Shot, right: Shot) -> list[Float32[np.ndarray, "h w 3"]]:
+    return [*left.fine_pictures(), *right.fine_pictures()]
