@@ -20,6 +20,7 @@ from stereoweave.io.animation import check_animation_ending
 from stereoweave.io.colormap import find_colour_range_px
 from stereoweave.io.files import replacing
 from stereoweave.io.images import checking_format_size, picture_kind, write_image
+from stereoweave.rendering.floating_windows import cut_windows
 from stereoweave.rendering.renderer import Renderer, check_position
 from stereoweave.stereo import Estimate, StereoPair
 
@@ -68,11 +69,14 @@ class LayoutOptions:
         columns, rows: Number of columns and rows of views in a quilt.
         range_px: Disparities shown as black and as white in rgbd; default: the image's own range. A video
             uses one range for all frames, to avoid flicker.
+        windows_px: Widths of the floating windows at the left and at the right border (`floating_windows`),
+            in layouts of two views.
     """
 
     columns: int = 8
     rows: int = 6
     range_px: tuple[float, float] | None = None
+    windows_px: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < 1 or not 2 <= self.columns * self.rows <= _MOST_VIEWS:
@@ -137,7 +141,7 @@ def render_views(renderer: Renderer, positions: Iterable[float]) -> Iterator[UIn
 
 def side_by_side(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
     """Return both eyes' views side by side at full width, with the left eye's on the left."""
-    return np.hstack(_render_eyes(renderer))
+    return np.hstack(_render_eyes(renderer, choices))
 
 
 def side_by_side_half(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
@@ -145,17 +149,17 @@ def side_by_side_half(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.nd
 
     If the width is odd, the last column is repeated.
     """
-    return np.hstack([squeeze(eye, axis=1) for eye in _render_eyes(renderer)])
+    return np.hstack([squeeze(eye, axis=1) for eye in _render_eyes(renderer, choices)])
 
 
 def crossed(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
     """Return both eyes' views side by side, with the right eye's on the left, for cross-eyed viewing."""
-    return np.hstack(_render_eyes(renderer)[::-1])
+    return np.hstack(_render_eyes(renderer, choices)[::-1])
 
 
 def top_bottom(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
     """Return both eyes' views one above the other at full height, with the left eye's on top."""
-    return np.vstack(_render_eyes(renderer))
+    return np.vstack(_render_eyes(renderer, choices))
 
 
 def top_bottom_half(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
@@ -163,7 +167,7 @@ def top_bottom_half(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndar
 
     If the height is odd, the last row is repeated.
     """
-    return np.vstack([squeeze(eye, axis=0) for eye in _render_eyes(renderer)])
+    return np.vstack([squeeze(eye, axis=0) for eye in _render_eyes(renderer, choices)])
 
 
 def make_anaglyph(kind: str) -> Callable[[Renderer, LayoutOptions], np.ndarray]:
@@ -176,7 +180,7 @@ def make_anaglyph(kind: str) -> Callable[[Renderer, LayoutOptions], np.ndarray]:
     def compose(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
         left, right = (
             cv2.transform(eye.astype(np.float32), matrix)
-            for eye, matrix in zip(_render_eyes(renderer), shares, strict=True)
+            for eye, matrix in zip(_render_eyes(renderer, choices), shares, strict=True)
         )
         # Round and clip only the sum, not each eye's part.
         return cv2.add(left, right, dtype=cv2.CV_8U)
@@ -283,6 +287,21 @@ def choose_layout(path: str | Path, name: str | None) -> str | None:
     return name
 
 
+def has_two_views(name: str | None) -> bool:
+    """Return whether a layout shows the views of two eyes, which may have floating windows."""
+    return name in LAYOUTS and LAYOUTS[name].positions == (0.0, 1.0)
+
+
+def check_shows_depth(name: str | None) -> None:
+    """Raise a StereoweaveError if a layout does not show several views at once, which a screen needs."""
+    if name not in LAYOUTS or not LAYOUTS[name].positions:
+        raise StereoweaveError(
+            f"expected only with a layout of several views, found with {name or 'a single view'}",
+            setting="screen",
+            remedy=Remedy("choose one, such as side_by_side or anaglyph_dubois", ("layout",)),
+        )
+
+
 def is_converged(name: str | None) -> bool:
     """Return whether the middle of the scene has no parallax by default in a layout; see `Layout`."""
     return name == VIEWER or name in ANIMATIONS or (name in LAYOUTS and LAYOUTS[name].converged)
@@ -334,9 +353,10 @@ def write_picture(path: str | Path, picture: UInt8[np.ndarray, "h w 3"]) -> None
             left.save(temporary, "MPO", save_all=True, append_images=[right], **_FINE)
 
 
-def _render_eyes(renderer: Renderer) -> list[UInt8[np.ndarray, "h w 3"]]:
-    """Render the views of the left and the right eye."""
-    return list(render_views(renderer, (0.0, 1.0)))
+def _render_eyes(renderer: Renderer, choices: LayoutOptions) -> list[UInt8[np.ndarray, "h w 3"]]:
+    """Render the views of the left and the right eye, with their floating windows."""
+    left, right = render_views(renderer, (0.0, 1.0))
+    return cut_windows((left, right), choices.windows_px)
 
 
 def squeeze(eye: UInt8[np.ndarray, "h w 3"], axis: int) -> UInt8[np.ndarray, "h2 w2 3"]:
