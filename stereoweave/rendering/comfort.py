@@ -233,9 +233,7 @@ def fit_depth(
 
 def format_depth(front_percent: float, behind_percent: float) -> str:
     """Return a depth range in words; negative numbers are in front of the screen."""
-    # Adding 0 turns -0.0 into 0.0.
-    ends = (round(value, 1) + 0.0 for value in (-front_percent, behind_percent))
-    return "{:+.1f} % to {:+.1f} % of the width".format(*ends)
+    return f"{-front_percent:+z.1f} % to {behind_percent:+z.1f} % of the width"
 
 
 def _find_strength(depth: Depth, budget_px: tuple[float, float], convergence_px: float | None) -> float:
