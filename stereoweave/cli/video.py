@@ -10,9 +10,11 @@ from stereoweave.cli.commands import running_options, shows_steps
 from stereoweave.cli.options import (
     OldFormat,
     Provider,
+    Screen,
     Strength,
     Threads,
     make_parent_folder,
+    make_screen_choice,
     replace_old_option,
 )
 from stereoweave.errors import StereoweaveError
@@ -120,6 +122,7 @@ def video(  # noqa: PLR0913 - each is an option of the command line
     position: Position = None,
     layout: Layout = None,
     strength: Strength = None,
+    screen: Screen = None,
     convergence: Convergence = None,
     format: Format = None,
     rate: Rate = None,
@@ -152,6 +155,7 @@ def video(  # noqa: PLR0913 - each is an option of the command line
             layout=layout,
             strength=1.0 if strength is None else strength,
             convergence_px=convergence,
+            screen=make_screen_choice(screen, strength, convergence),
             rectify=rectify,
             backend=Backend(model=model, threads=threads, provider=provider),
             name_of=running_options(),
@@ -227,6 +231,8 @@ def _print_tally(out: Path, tally: "VideoTally") -> None:
     cuts = {0: "", 1: ", 1 cut"}.get(tally.cuts, f", {tally.cuts} cuts")
     frames = "1 frame" if tally.frames == 1 else f"{tally.frames} frames"
     typer.echo(f"{out}: {frames}{cuts}")
+    if tally.comfort:
+        typer.echo(tally.comfort)
     if tally.problems:
         more = "; ..." if tally.problems > len(tally.named) else ""
         typer.echo(f"problems in {tally.problems} of {frames}: {'; '.join(tally.named)}{more}")

@@ -149,6 +149,7 @@ def _list_settings(job: VideoJob, video: StereoVideo, sources: Sequence[Path]) -
         "strength": job.strength,
         "rectify": job.rectify,
         "convergence_px": job.convergence_px,
+        "screen": job.screen and [job.screen.name, job.screen.strength, job.screen.convergence_px],
         "arrangement": video.frame_packing,
         "rate": str(video.rate),
         "preview": video.excerpted,

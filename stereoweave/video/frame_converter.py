@@ -14,6 +14,7 @@ from stereoweave.stereo import Estimate
 from stereoweave.system.ahead import ahead
 from stereoweave.system.threads import thread_count
 from stereoweave.video.carried_frames import EstimatedFrame, carry_depth
+from stereoweave.video.comfort_path import ComfortPath
 from stereoweave.video.frame_groups import MATCHED_EVERY, FrameGroup, FrameGrouper
 from stereoweave.video.job import VideoJob
 from stereoweave.video.reader import StereoFrame, format_time
@@ -34,7 +35,8 @@ Item = TypeVar("Item")
 class VideoTally:
     """Counts of frames, cuts and frames with problems so far, and descriptions of the first problems.
 
-    `frames_per_s` is the speed of the conversion since it was last started; 0 while it runs.
+    `frames_per_s` is the speed of the conversion since it was last started; 0 while it runs. `comfort` says
+    how the depth was fitted to the job's screen; it is set at the end.
     """
 
     frames: int = 0
@@ -42,6 +44,7 @@ class VideoTally:
     problems: int = 0
     named: list[str] = field(default_factory=list)
     frames_per_s: float = 0.0
+    comfort: str = ""
 
     def add(self, frame: StereoFrame) -> None:
         """Count a frame and its problem, if it has one."""
@@ -71,13 +74,15 @@ class FrameConverter:
 
     def __init__(self, job: VideoJob, survey: Survey, size_px: tuple[int, int]) -> None:
         self.survey, self.tally = survey, VideoTally()
-        self._squeezed = squeeze_job(job, size_px)
+        self._size_px, self._squeezed = size_px, squeeze_job(job, size_px)
         self._seen = self._squeezed.squeeze_survey(survey)
         self._options = MatchOptions(range_px=self._seen.match_range_px)
         self._threads = thread_count(job.backend.threads)
         self._matcher = load_matcher(job)
         self._filter = TemporalFilter(job.backend.threads)
         self._grouper = FrameGrouper(ShotAligner(swapped=survey.swapped) if job.rectify else None)
+        screen = self._squeezed.job.screen
+        self._comfort = ComfortPath(screen) if screen else None
 
     @classmethod
     def from_state(
@@ -93,6 +98,9 @@ class FrameConverter:
         converter.tally = VideoTally(frames, cuts, problems, state.pop("named").tolist())
         converter._filter = TemporalFilter.from_state(state, job.backend.threads)
         converter._grouper = FrameGrouper.from_state(state)
+        screen = converter._squeezed.job.screen
+        if screen:
+            converter._comfort = ComfortPath.from_state(screen, state)
         return converter
 
     def state(self) -> dict[str, np.ndarray]:
@@ -106,6 +114,7 @@ class FrameConverter:
             "named": np.array(tally.named, dtype=np.str_),
             **self._filter.state(),
             **self._grouper.state(),
+            **(self._comfort.state() if self._comfort else {}),
         }
 
     @property
@@ -123,6 +132,8 @@ class FrameConverter:
         estimated = self._overlap(carry_depth(matched, self._filter, self._threads), _ESTIMATES_AHEAD)
         yield from self._overlap(map(self._render, estimated), _PICTURES_AHEAD)
         self.tally.cuts = self._filter.cuts
+        if self._comfort:
+            self.tally.comfort = self._comfort.describe(self._size_px[0])
 
     def _match(self, group: FrameGroup) -> tuple[FrameGroup, Estimate]:
         return group, match(self._matcher, group.pairs[-1], self._options)
@@ -130,7 +141,9 @@ class FrameConverter:
     def _render(self, estimated: EstimatedFrame) -> tuple[Fraction, Picture]:
         frame, pair, estimate = estimated
         self.tally.add(frame)
-        return frame.time, self._squeezed.job.render_frame(pair, estimate, self._seen)
+        begins = self._grouper.began_shot(frame)
+        look = self._comfort(estimate, frame.time, begins_shot=begins) if self._comfort else None
+        return frame.time, self._squeezed.job.render_frame(pair, estimate, self._seen, look)
 
     def _overlap(self, items: Iterable[Item], count: int) -> Iterator[Item]:
         """Compute items ahead of their use, if more than one thread is allowed."""

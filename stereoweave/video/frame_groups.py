@@ -1,6 +1,7 @@
 """Frames of a video in groups, each of which ends with a frame to match; aligned, shot by shot."""
 
 from collections.abc import Iterable, Iterator, Mapping
+from fractions import Fraction
 from itertools import islice
 from typing import NamedTuple
 
@@ -43,6 +44,7 @@ class FrameGrouper:
         self, aligner: ShotAligner | None, last_grey: UInt8[np.ndarray, "h w"] | None = None
     ) -> None:
         self._aligner, self._last_grey = aligner, last_grey
+        self._first_times: set[Fraction] = set()
 
     def __call__(self, frames: Iterable[StereoFrame]) -> Iterator[FrameGroup]:
         """Yield the frames in groups. The last frame ends a group, so that it is matched in any case."""
@@ -55,6 +57,12 @@ class FrameGrouper:
                 continue
             for frame in several:
                 yield FrameGroup([frame], [self._begin(frame)])
+
+    def began_shot(self, frame: StereoFrame) -> bool:
+        """Return whether a frame that was yielded is the first one after a cut; true once for each."""
+        begins = frame.time in self._first_times
+        self._first_times.discard(frame.time)
+        return begins
 
     @property
     def has_warped(self) -> bool:
@@ -74,8 +82,10 @@ class FrameGrouper:
     def _begin(self, frame: StereoFrame) -> StereoPair:
         """Return a frame's aligned pair; if the frame begins a shot, its rows are measured."""
         grey = _make_thumbnail(frame)
-        if self._aligner and self._last_grey is not None and self._begins_shot(grey):
-            self._aligner.begin_shot()
+        if self._last_grey is not None and self._begins_shot(grey):
+            self._first_times.add(frame.time)
+            if self._aligner:
+                self._aligner.begin_shot()
         self._last_grey = grey
         return self._align(frame)
 

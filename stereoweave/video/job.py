@@ -9,9 +9,17 @@ from jaxtyping import Float, UInt16
 from stereoweave.errors import NameOf, Note, Remedy, StereoweaveError, keyword
 from stereoweave.io.colormap import colour_disparity
 from stereoweave.matching.backend import Backend
-from stereoweave.rendering.layouts import LAYOUTS, LayoutOptions, check_positions
+from stereoweave.rendering.comfort import ScreenChoice
+from stereoweave.rendering.layouts import (
+    LAYOUTS,
+    LayoutOptions,
+    check_positions,
+    check_shows_depth,
+    has_two_views,
+)
 from stereoweave.rendering.renderer import Renderer
 from stereoweave.stereo import Estimate, StereoCamera, StereoPair
+from stereoweave.video.comfort_path import FrameComfort
 from stereoweave.video.survey import Survey
 from stereoweave.video.writer import Picture
 
@@ -38,6 +46,8 @@ class VideoJob:
         rectify: Whether to rectify the shots whose rows are apart, and to swap the sides if they are swapped.
         backend: Backend that matches the frames.
         name_of: Function that returns the front end's name for a setting, used in notes.
+        screen: Screen that decides strength and convergence frame by frame, in their place; for layouts of
+            several views.
     """
 
     depth: bool = False
@@ -49,6 +59,7 @@ class VideoJob:
     rectify: bool = True
     backend: Backend = Backend()
     name_of: NameOf = keyword
+    screen: ScreenChoice | None = None
 
     def __post_init__(self) -> None:
         kinds = {
@@ -67,6 +78,8 @@ class VideoJob:
             raise StereoweaveError(
                 f"expected one of {', '.join(LAYOUTS)}, found {self.layout!r}", setting="layout"
             )
+        if self.screen is not None:
+            check_shows_depth(self.layout or given[0])
         self._check_numbers(given[0] if self.layout is None else f"layout {self.layout}")
         check_positions(self._positions, self.strength)
 
@@ -89,8 +102,10 @@ class VideoJob:
             return LAYOUTS[self.layout].positions
         return () if self.position is None else (self.position,)
 
-    def render_frame(self, pair: StereoPair, estimate: Estimate, survey: Survey) -> Picture:
-        """Render the output image of one frame."""
+    def render_frame(
+        self, pair: StereoPair, estimate: Estimate, survey: Survey, look: FrameComfort | None = None
+    ) -> Picture:
+        """Render the output image of one frame; `look` takes the place of strength and convergence."""
         if self.depth:
             return colour_disparity(estimate.disparity_px, survey.range_px)
         if self.depth16:
@@ -98,13 +113,15 @@ class VideoJob:
         renderer = Renderer(
             pair,
             estimate,
-            strength=self.strength,
-            convergence_px=self._find_plane_px(survey),
+            strength=look.strength if look else self.strength,
+            convergence_px=look.convergence_px if look else self._find_plane_px(survey),
             threads=self.backend.threads,
         )
         if self.position is not None:
             return renderer.view(self.position).image
-        return LAYOUTS[str(self.layout)].compose(renderer, LayoutOptions(range_px=survey.range_px))
+        windows_px = look.windows_px if look and has_two_views(self.layout) else (0.0, 0.0)
+        options = LayoutOptions(range_px=survey.range_px, windows_px=windows_px)
+        return LAYOUTS[str(self.layout)].compose(renderer, options)
 
     def _find_plane_px(self, survey: Survey) -> float:
         """Return the disparity of the points that stay in the same column in all views."""
