@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from stereoweave.matching.matcher import Matcher
     from stereoweave.matching.opencv_interface.stereo_matcher import StereoMatcher
     from stereoweave.pictures.estimate import estimate
+    from stereoweave.rendering.comfort import fit_screen
     from stereoweave.rendering.renderer import render
     from stereoweave.rendering.synthesize import synthesize
     from stereoweave.stereo import DepthCurve, Estimate, Sample, StereoCamera, StereoPair, View
@@ -30,6 +31,7 @@ _HOMES = {
     "StereoweaveError": "errors",
     "View": "stereo",
     "estimate": "pictures.estimate",
+    "fit_screen": "rendering.comfort",
     "read_image": "io.images",
     "render": "rendering.renderer",
     "synthesize": "rendering.synthesize",
@@ -49,6 +51,7 @@ __all__ = [
     "View",
     "__version__",
     "estimate",
+    "fit_screen",
     "read_image",
     "render",
     "synthesize",

@@ -26,6 +26,7 @@ VARIABLE: dict[tuple[str, str], set[str]] = {
     ("app/pair_form.py", "setting"): {"focal_px", "baseline_m"},
     ("errors.py", "error.setting"): set(),  # of an error that another one takes the place of
     ("pictures/pair_finding.py", "side"): {"left", "right"},
+    ("rendering/comfort.py", "name"): {"strength", "convergence_px"},
     ("rendering/renderer.py", "name"): {"up", "forward"},
     ("stereo.py", "name"): {"focal_px", "baseline_m"},
     ("synth/sets/make.py", "name"): {"pairs", "seed", "frames"},
@@ -39,13 +40,13 @@ ABSENT = {
     "page": {
         *("align", "board", "convergence_px", "files", "forward", "layout", "left"),
         *("listed", "out", "provider", "quilt", "range_px", "raw", "refined"),
-        *("right", "strength", "up"),
+        *("right", "screen", "strength", "up"),
         *("projection", "look_deg", "fov_deg", "lens_fov_deg", "whole"),
     },
     "service": {
         *("align", "board", "convergence_px", "crop", "files", "forward", "layout", "left"),
         *("listed", "no_rectify", "out", "provider", "quilt", "raw"),
-        *("right", "up"),
+        *("right", "screen", "up"),
         *("projection", "look_deg", "fov_deg", "lens_fov_deg", "whole"),
     },
 }

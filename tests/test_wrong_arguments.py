@@ -104,6 +104,7 @@ def calls() -> list[Call]:
         Call("render with camera", sw.render, **pair, estimate=FOUND, position=0.5, up=0.1, camera=CAMERA),
         Call("Renderer", Renderer, pair=PAIR, estimate=FOUND, **look, threads=1),
         Call("Renderer.view", Renderer(PAIR, FOUND, threads=1).view, position=0.5, **place),
+        Call("fit_screen", sw.fit_screen, estimate=FOUND, screen="phone", **look),
         Call("synthesize", sw.synthesize, **pair, position=0.5, **how),
         Call("StereoCamera", sw.StereoCamera, **camera),
         Call("StereoCamera.centred", sw.StereoCamera.centred, image=LEFT, focal_px=100.0, baseline_m=0.1),
@@ -157,7 +158,7 @@ def test_every_argument_of_the_interface_is_tested():
     tried = {call.name.split(" ")[0]: set(call.right) for call in calls()}
     for call in calls():
         tried[call.name.split(" ")[0]] |= set(call.right)
-    functions = ("estimate", "render", "synthesize", "read_image")
+    functions = ("estimate", "fit_screen", "render", "synthesize", "read_image")
     for name in (*functions, "Matcher", "StereoCamera", "StereoMatcher", "StereoPair", "Estimate"):
         assert tried[name] == set(inspect.signature(getattr(sw, name)).parameters), name
     assert set(sw.__all__) - {name.split(".")[0] for name in tried} == {

@@ -17,6 +17,7 @@ from stereoweave.errors import StereoweaveError, reason, require_extra
 if TYPE_CHECKING:
     from stereoweave.cameras.spherical import SphereRequest
     from stereoweave.pictures.prepare import Request
+    from stereoweave.rendering.comfort import ScreenChoice
     from stereoweave.system.ray_engine import Engine
 
 _LEAST_SIDE_PX = 32
@@ -118,7 +119,22 @@ Raw = Annotated[
         help="Write the network's own disparity: occluded pixels are not filled, and nothing is refined.",
     ),
 ]
-Strength = Annotated[float, typer.Option(min=0, help="Factor that scales the baseline about its midpoint.")]
+Strength = Annotated[
+    float | None,
+    typer.Option(
+        min=0,
+        help="Factor that scales the baseline about its midpoint (default: 1, or what suits --screen).",
+    ),
+]
+Screen = Annotated[
+    str | None,
+    typer.Option(
+        help="Screen that will show a layout of several views: phone, television, headset or light_field. "
+        "Strength, at most 1, and convergence are chosen so that the depth fits it without strain, and black "
+        "bars cover what near objects lose at the left and right border; --strength and --convergence keep "
+        "the values given."
+    ),
+]
 Model = Annotated[
     str,
     typer.Option(
@@ -192,6 +208,17 @@ def make_sphere_request(
         lens_fov_deg=lens_fov,
         whole=whole,
     )
+
+
+def make_screen_choice(
+    screen: str | None, strength: float | None, convergence_px: float | None
+) -> "ScreenChoice | None":
+    """Return the screen of --screen with the values that the user gave; None if it is not given."""
+    if screen is None:
+        return None
+    from stereoweave.rendering.comfort import ScreenChoice
+
+    return ScreenChoice(name=screen, strength=strength, convergence_px=convergence_px)
 
 
 def make_request(  # noqa: PLR0913 - each is an option of the command line

@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from stereoweave.cli.commands import running_options, shows_steps
+from stereoweave.cli.film_check import check_film, is_video, refuse_film_options
 from stereoweave.cli.options import (
     AsJson,
     Calib,
@@ -23,29 +24,70 @@ from stereoweave.cli.options import (
     make_parent_folder,
     make_sphere_request,
 )
-from stereoweave.errors import Note, StereoweaveError
+from stereoweave.errors import FormatError, Note, StereoweaveError
 from stereoweave.system.steps import step
+
+Checked = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="PICTURE",
+        help="LEFT RIGHT, two pictures of the same size; one picture that holds both views; or a stereo "
+        "video.",
+    ),
+]
+Film = Annotated[
+    bool,
+    typer.Option(
+        "--film", help="Check a stereo video, shot by shot (default: if the file is recognised as a video)."
+    ),
+]
+CheckedScreen = Annotated[
+    str | None,
+    typer.Option(
+        "--screen",
+        help="Screen that will show the video as it is: phone, television, headset or light_field. More "
+        "depth than it shows without strain is then a problem; so are near objects that a border cuts off.",
+    ),
+]
+Timeline = Annotated[
+    Path | None,
+    typer.Option(metavar="PICTURE", help="Picture to write of the video's depth and problems over time."),
+]
 
 
 @shows_steps
 def check(  # noqa: PLR0913 - each is an option of the command line
-    pictures: Pictures,
+    pictures: Checked,
     format: Format = None,
     projection: Projection = None,
     look: Look = None,
     fov: Fov = None,
     lens_fov: LensFov = None,
     as_json: AsJson = False,
+    film: Film = False,
+    screen: CheckedScreen = None,
+    timeline: Timeline = None,
 ) -> None:
-    """Check a pair for problems, and report each with its remedy.
+    """Check a pair or a stereo video for problems.
 
-    The checks cover rectification, swapped pictures, disparity range and exposure. The exit status is 1 if
-    there is a problem.
+    The checks cover rectification, swapped pictures, disparity range, exposure and, in a video, colour, empty
+    eyes and near objects that a border cuts off, shot by shot. The exit status is 1 if there is a problem.
     """
     from stereoweave.cameras.alignment import check_pair
     from stereoweave.pictures.loading import open_pictures
+    from stereoweave.video.reader import open_video
 
-    opened = open_pictures(pictures, format, make_sphere_request(projection, look, fov, lens_fov))
+    sphere = make_sphere_request(projection, look, fov, lens_fov)
+    try:
+        opened = None if film else open_pictures(pictures, format, sphere)
+    except FormatError as error:
+        if not is_video(error):
+            raise
+        opened = None
+    if opened is None:
+        check_film(open_video(pictures, format, sphere=sphere), screen, timeline, as_json)
+        return
+    refuse_film_options(screen, timeline)
     with step("checking the pair"):
         found = check_pair(opened.pair.left, opened.pair.right)
     lines = _advise_once(found.lines())

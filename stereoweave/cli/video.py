@@ -14,10 +14,12 @@ from stereoweave.cli.options import (
     OldFormat,
     Projection,
     Provider,
+    Screen,
     Strength,
     Threads,
     Whole,
     make_parent_folder,
+    make_screen_choice,
     make_sphere_request,
     replace_old_option,
 )
@@ -142,7 +144,8 @@ def video(  # noqa: PLR0913 - each is an option of the command line
     position: Position = None,
     layout: Layout = None,
     bits: Bits = 8,
-    strength: Strength = 1.0,
+    strength: Strength = None,
+    screen: Screen = None,
     convergence: Convergence = None,
     format: Format = None,
     rate: Rate = None,
@@ -180,8 +183,9 @@ def video(  # noqa: PLR0913 - each is an option of the command line
             position=position,
             layout=layout,
             bits=bits,
-            strength=strength,
+            strength=1.0 if strength is None else strength,
             convergence_px=convergence,
+            screen=make_screen_choice(screen, strength, convergence),
             rectify=rectify,
             backend=Backend(model=model, threads=threads, provider=provider),
             name_of=running_options(),
@@ -262,6 +266,8 @@ def _print_tally(out: Path, tally: "VideoTally") -> None:
     cuts = {0: "", 1: ", 1 cut"}.get(tally.cuts, f", {tally.cuts} cuts")
     frames = "1 frame" if tally.frames == 1 else f"{tally.frames} frames"
     typer.echo(f"{out}: {frames}{cuts}")
+    if tally.comfort:
+        typer.echo(tally.comfort)
     if tally.problems:
         more = "; ..." if tally.problems > len(tally.named) else ""
         typer.echo(f"problems in {tally.problems} of {frames}: {'; '.join(tally.named)}{more}")

@@ -20,11 +20,13 @@ from stereoweave.cli.options import (
     Provider,
     Range,
     Rectify,
+    Screen,
     Strength,
     Threads,
     Whole,
     make_parent_folder,
     make_request,
+    make_screen_choice,
     make_sphere_request,
     parse_largest_size_px,
     parse_range_px,
@@ -111,7 +113,8 @@ def view(  # noqa: PLR0913 - each is an option of the command line
     up: Up = 0.0,
     forward: Forward = 0.0,
     layout: Layout = None,
-    strength: Strength = 1.0,
+    strength: Strength = None,
+    screen: Screen = None,
     convergence: Convergence = None,
     quilt: Quilt = None,
     size: Size = None,
@@ -144,6 +147,8 @@ def view(  # noqa: PLR0913 - each is an option of the command line
     out = out or _name_view(pictures, layout)
     name = choose_layout(out, layout)
     _check_unused(name, {"--position": position, "--up": up or None, "--forward": forward or None}, quilt)
+    given_px = None if convergence in (None, "auto") else _parse_convergence_px(str(convergence))
+    chosen = make_screen_choice(screen, strength, given_px)
     _check_has_views(name, strength, convergence)
     file = ViewFile(
         path=out,
@@ -151,7 +156,8 @@ def view(  # noqa: PLR0913 - each is an option of the command line
         position=_MIDDLE if position is None else position,
         up=up,
         forward=forward,
-        strength=strength,
+        strength=1.0 if strength is None else strength,
+        screen=chosen,
         convergence_px=_parse_convergence_px(convergence or ("auto" if is_converged(name) else "0")),
         layout_options=_parse_quilt(quilt),
         size_px=parse_largest_size_px(size),
@@ -203,9 +209,9 @@ def _check_unused(name: str | None, single_view: dict[str, float | None], quilt:
         )
 
 
-def _check_has_views(name: str | None, strength: float, convergence: str | None) -> None:
+def _check_has_views(name: str | None, strength: float | None, convergence: str | None) -> None:
     """Raise a StereoweaveError if the layout has no views that strength and convergence could shift."""
-    if name == "rgbd" and (strength != 1 or convergence is not None):
+    if name == "rgbd" and (strength not in (None, 1) or convergence is not None):
         raise StereoweaveError(
             "--strength, --convergence: expected only with a layout of several views, found with rgbd"
         )

@@ -12,7 +12,9 @@ from stereoweave.io.animation import write_animation
 from stereoweave.io.images import write_image
 from stereoweave.outputs.viewer import make_viewer, write_viewer
 from stereoweave.outputs.viewer_scene import LARGEST_PX, POSITIONS
+from stereoweave.rendering.comfort import ScreenChoice, measure_any_depth
 from stereoweave.rendering.cropping import find_common_part
+from stereoweave.rendering.floating_windows import find_windows_px
 from stereoweave.rendering.layouts import (
     ANIMATIONS,
     LAYOUTS,
@@ -20,6 +22,8 @@ from stereoweave.rendering.layouts import (
     LayoutOptions,
     add_mark,
     check_positions,
+    check_shows_depth,
+    has_two_views,
     median_disparity_px,
     render_views,
     write_picture,
@@ -54,6 +58,8 @@ class ViewFile:
         size_px: Largest width and height of each view; None for the pictures' size.
         crops: Whether to cut off the borders that not every view shows.
         threads: Number of threads; default: all cores.
+        screen: Screen that decides strength and convergence, in their place; for layouts of several views.
+        windows: Whether a layout of two views has floating windows, unless its borders are cut off.
     """
 
     path: Path
@@ -67,8 +73,12 @@ class ViewFile:
     size_px: tuple[int, int] | None = None
     crops: bool = False
     threads: int | None = None
+    screen: ScreenChoice | None = None
+    windows: bool = False
 
     def __post_init__(self) -> None:
+        if self.screen is not None:
+            check_shows_depth(self.name)
         check_position(0.5, up=self.up, forward=self.forward)
         check_positions(self._positions, self.strength)
         if self.crops and not can_crop(self.name):
@@ -110,6 +120,8 @@ class ViewFile:
 
         `pictures` are the pair's files, of which the viewer shows the names.
         """
+        if self.screen is not None:
+            return self._write_for_screen(self.screen, pair, estimate, pictures)
         plane_px = median_disparity_px(estimate) if self.convergence_px is None else self.convergence_px
         if self.name == VIEWER:
             return self._write_viewer(pair, estimate, plane_px, pictures)
@@ -123,6 +135,16 @@ class ViewFile:
         if self.name is None:
             return self._write_view(renderer)
         return self._write_layout(renderer, self.name)
+
+    def _write_for_screen(
+        self, screen: ScreenChoice, pair: StereoPair, estimate: Estimate, pictures: Iterable[Path]
+    ) -> WrittenView:
+        fit = screen.fit(measure_any_depth(estimate), pair.left.shape[1])
+        fitted = replace(
+            self, screen=None, windows=True, strength=fit.strength, convergence_px=fit.convergence_px
+        )
+        written = fitted.write(pair, estimate, pictures)
+        return replace(written, description=f"{written.description}\n{screen.describe(fit)}")
 
     def _find_part(self, renderer: Renderer) -> tuple[slice, slice]:
         """Return the rows and columns of the views to write."""
@@ -145,9 +167,10 @@ class ViewFile:
     def _write_layout(self, renderer: Renderer, name: str) -> WrittenView:
         part = self._find_part(renderer)
         if name in LAYOUTS:
-            image = _cut(LAYOUTS[name].compose(renderer, self.layout_options), part)
+            options, said = self._add_windows(renderer, name)
+            image = _cut(LAYOUTS[name].compose(renderer, options), part)
             write_picture(self.path, image)
-            return WrittenView(f"{name}, {image.shape[1]}x{image.shape[0]} px", image)
+            return WrittenView(f"{name}, {image.shape[1]}x{image.shape[0]} px{said}", image)
         motion = ANIMATIONS[name]
         turns = motion.turns(self.path)
         frames = render_views(renderer, motion.positions * turns)
@@ -156,6 +179,17 @@ class ViewFile:
             return WrittenView(f"{name}, a still picture, because nothing moves in it")
         length_s = len(motion.positions) * turns * motion.frame_ms / 1000
         return WrittenView(f"{name}, {count} frames in {length_s:g} s")
+
+    def _add_windows(self, renderer: Renderer, name: str) -> tuple[LayoutOptions, str]:
+        """Return the layout's options with its floating windows, and the words about them."""
+        if not self.windows or self.crops or not has_two_views(name):
+            return self.layout_options, ""
+        windows_px = find_windows_px(
+            renderer.estimate, strength=renderer.strength, convergence_px=renderer.convergence_px
+        )
+        bars = [f"{px:.0f} px {side}" for px, side in zip(windows_px, ("left", "right"), strict=True) if px]
+        said = f", floating window {' and '.join(bars)}" if bars else ""
+        return replace(self.layout_options, windows_px=windows_px), said
 
     def _write_viewer(
         self, pair: StereoPair, estimate: Estimate, plane_px: float, pictures: Iterable[Path]

@@ -5,15 +5,25 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float32, UInt16
 
+from stereoweave.rendering.floating_windows import cut_windows
 from stereoweave.rendering.layouts import Eye
 from stereoweave.rendering.renderer import Renderer
 
 _LEVELS_OF_16_BITS = 65535 / 255
 
 
-def compose_fine(renderer: Renderer, join: Callable[[Eye, Eye], Eye]) -> UInt16[np.ndarray, "h w 3"]:
-    """Return a layout of both eyes' views, from 0 to 65535, arranged by its function `join`."""
-    return to_16_bits(join(renderer.fine_view(0.0), renderer.fine_view(1.0)))
+def compose_fine(
+    renderer: Renderer, join: Callable[[Eye, Eye], Eye], windows_px: tuple[float, float] = (0.0, 0.0)
+) -> UInt16[np.ndarray, "h w 3"]:
+    """Return a layout of both eyes' views, from 0 to 65535.
+
+    Args:
+        renderer: Renderer with fine images.
+        join: The layout's function of this name.
+        windows_px: See `LayoutOptions`.
+    """
+    eyes = renderer.fine_view(0.0), renderer.fine_view(1.0)
+    return to_16_bits(join(*cut_windows(eyes, windows_px)))
 
 
 def to_16_bits(picture: Float32[np.ndarray, "h w 3"]) -> UInt16[np.ndarray, "h w 3"]:

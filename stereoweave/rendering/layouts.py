@@ -21,6 +21,7 @@ from stereoweave.io.animation import check_animation_ending
 from stereoweave.io.colormap import find_colour_range_px
 from stereoweave.io.files import replacing
 from stereoweave.io.images import checking_format_size, picture_kind, write_image
+from stereoweave.rendering.floating_windows import cut_windows
 from stereoweave.rendering.renderer import Renderer, check_position
 from stereoweave.stereo import Estimate, StereoPair
 
@@ -69,11 +70,14 @@ class LayoutOptions:
         columns, rows: Number of columns and rows of views in a quilt.
         range_px: Disparities shown as black and as white in rgbd; default: the image's own range. A video
             uses one range for all frames, to avoid flicker.
+        windows_px: Widths of the floating windows at the left and at the right border (`floating_windows`),
+            in layouts of two views.
     """
 
     columns: int = 8
     rows: int = 6
     range_px: tuple[float, float] | None = None
+    windows_px: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < 1 or not 2 <= self.columns * self.rows <= _MOST_VIEWS:
@@ -225,7 +229,8 @@ def _compose_eyes(join: Callable[[Eye, Eye], Eye]) -> Callable[[Renderer, Layout
     """Return the `compose` function of a layout that shows the views of both eyes and nothing else."""
 
     def compose(renderer: Renderer, choices: LayoutOptions) -> Eye:
-        return join(*render_views(renderer, (0.0, 1.0)))
+        left, right = render_views(renderer, (0.0, 1.0))
+        return join(*cut_windows((left, right), choices.windows_px))
 
     return compose
 
@@ -302,6 +307,21 @@ def choose_layout(path: str | Path, name: str | None) -> str | None:
     else:
         picture_kind(path)
     return name
+
+
+def has_two_views(name: str | None) -> bool:
+    """Return whether a layout shows the views of two eyes, which may have floating windows."""
+    return name in LAYOUTS and LAYOUTS[name].positions == (0.0, 1.0)
+
+
+def check_shows_depth(name: str | None) -> None:
+    """Raise a StereoweaveError if a layout does not show several views at once, which a screen needs."""
+    if name not in LAYOUTS or not LAYOUTS[name].positions:
+        raise StereoweaveError(
+            f"expected only with a layout of several views, found with {name or 'a single view'}",
+            setting="screen",
+            remedy=Remedy("choose one, such as side_by_side or anaglyph_dubois", ("layout",)),
+        )
 
 
 def is_converged(name: str | None) -> bool:

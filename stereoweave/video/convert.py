@@ -20,6 +20,7 @@ from stereoweave.system.compiling_ahead import Rehearsal, compile_ahead
 from stereoweave.system.progress import progress
 from stereoweave.system.threads import thread_count
 from stereoweave.video.carried_frames import rehearse_carrying
+from stereoweave.video.depth_codes import describe_values, find_losses
 from stereoweave.video.frame_converter import FrameConverter, VideoTally, load_matcher
 from stereoweave.video.job import VideoJob
 from stereoweave.video.layout_marks import mark_layout
@@ -105,7 +106,7 @@ def convert_video(
                 video, matcher, bar, rectified=job.rectify, threads=job.backend.threads
             )
             converter = FrameConverter(job, survey, video.size_px)
-            for note in [*notes, *job.find_losses(survey)]:
+            for note in [*notes, *find_losses(job, survey)]:
                 _print_line(console, note.format(job.name_of))
         frames = video.frames(converter.tally.frames)
         opening = list(islice(frames, 1))  # may decode frames before it, which is no part of the speed
@@ -114,7 +115,7 @@ def convert_video(
             part = islice(chain([first], frames), round(PART_S * video.rate) or 1)
             with parts.next(converter.state) as path, closing(converter.convert(part)) as pictures:
                 recorder.write_part(path, map(meter.count, pictures))
-        said = job.describe_values(converter.survey, video.camera, rectified=converter.has_warped)
+        said = describe_values(job, converter.survey, video.camera, rectified=converter.has_warped)
         marks = _mark_output(job, video, warped=converter.has_warped)
         recorder.join(parts.files, video.sound, out, said, marks)
     return replace(converter.tally, frames_per_s=meter.frames_per_s)
@@ -216,6 +217,7 @@ def _list_settings(job: VideoJob, video: StereoVideo, sources: Sequence[Path]) -
         "strength": job.strength,
         "rectify": job.rectify,
         "convergence_px": job.convergence_px,
+        "screen": job.screen and [job.screen.name, job.screen.strength, job.screen.convergence_px],
         "arrangement": video.frame_packing,
         "rate": str(video.rate),
         "preview": video.excerpted,

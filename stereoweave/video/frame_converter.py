@@ -17,7 +17,9 @@ from stereoweave.stereo import Estimate
 from stereoweave.system.ahead import ahead
 from stereoweave.system.threads import thread_count
 from stereoweave.video.carried_frames import EstimatedFrame, carry_depth
+from stereoweave.video.comfort_path import ComfortPath
 from stereoweave.video.frame_groups import MATCHED_EVERY, FrameGroup, FrameGrouper
+from stereoweave.video.frame_renderer import FrameRenderer
 from stereoweave.video.job import VideoJob
 from stereoweave.video.reader import StereoFrame, format_time
 from stereoweave.video.shot_alignment import ShotAligner
@@ -37,7 +39,8 @@ Item = TypeVar("Item")
 class VideoTally:
     """Counts of frames, cuts and frames with problems so far, and descriptions of the first problems.
 
-    `frames_per_s` is the speed of the conversion since it was last started; 0 while it runs.
+    `frames_per_s` is the speed of the conversion since it was last started; 0 while it runs. `comfort` says
+    how the depth was fitted to the job's screen; it is set at the end.
     """
 
     frames: int = 0
@@ -45,6 +48,7 @@ class VideoTally:
     problems: int = 0
     named: list[str] = field(default_factory=list)
     frames_per_s: float = 0.0
+    comfort: str = ""
 
     def add(self, frame: StereoFrame) -> None:
         """Count a frame and its problem, if it has one."""
@@ -74,13 +78,16 @@ class FrameConverter:
 
     def __init__(self, job: VideoJob, survey: Survey, size_px: tuple[int, int]) -> None:
         self.survey, self.tally = survey, VideoTally()
-        self._squeezed = squeeze_job(job, size_px)
-        self._seen = self._squeezed.squeeze_survey(survey)
-        self._options = MatchOptions(range_px=self._seen.match_range_px)
+        self._size_px, self._squeezed = size_px, squeeze_job(job, size_px)
+        seen = self._squeezed.squeeze_survey(survey)
+        self._options = MatchOptions(range_px=seen.match_range_px)
+        self._renderer = FrameRenderer(self._squeezed.job, seen)
         self._threads = thread_count(job.backend.threads)
         self._matcher = load_matcher(job)
         self._filter = TemporalFilter(job.backend.threads)
         self._grouper = FrameGrouper(ShotAligner(swapped=survey.swapped) if job.rectify else None)
+        screen = self._squeezed.job.screen
+        self._comfort = ComfortPath(screen) if screen else None
 
     @classmethod
     def from_state(
@@ -96,6 +103,9 @@ class FrameConverter:
         converter.tally = VideoTally(frames, cuts, problems, state.pop("named").tolist())
         converter._filter = TemporalFilter.from_state(state, job.backend.threads)
         converter._grouper = FrameGrouper.from_state(state)
+        screen = converter._squeezed.job.screen
+        if screen:
+            converter._comfort = ComfortPath.from_state(screen, state)
         return converter
 
     def state(self) -> dict[str, np.ndarray]:
@@ -109,6 +119,7 @@ class FrameConverter:
             "named": np.array(tally.named, dtype=np.str_),
             **self._filter.state(),
             **self._grouper.state(),
+            **(self._comfort.state() if self._comfort else {}),
         }
 
     @property
@@ -126,6 +137,8 @@ class FrameConverter:
         converted = self._convert_depth(groups) if join is None else self._join_views(groups, join)
         yield from self._overlap(converted, _PICTURES_AHEAD)
         self.tally.cuts = self._grouper.cuts
+        if self._comfort:
+            self.tally.comfort = self._comfort.describe(self._size_px[0])
 
     def _convert_depth(self, groups: Iterator[FrameGroup]) -> Iterator[tuple[Fraction, Picture]]:
         matched = self._overlap(map(self._match, groups), _GROUPS_AHEAD)
@@ -147,10 +160,9 @@ class FrameConverter:
     def _render(self, estimated: EstimatedFrame) -> tuple[Fraction, Picture]:
         frame, pair, estimate = estimated
         self.tally.add(frame)
-        job = self._squeezed.job
-        if frame.fine:
-            return frame.time, job.render_fine_frame(frame.fine(), estimate, self._seen)
-        return frame.time, job.render_frame(pair, estimate, self._seen)
+        begins = self._grouper.began_shot(frame)
+        comfort = self._comfort(estimate, frame.time, begins_shot=begins) if self._comfort else None
+        return frame.time, self._renderer(pair, estimate, frame.fine and frame.fine(), comfort)
 
     def _overlap(self, items: Iterable[Item], count: int) -> Iterator[Item]:
         """Compute items ahead of their use, if more than one thread is allowed."""

@@ -1,6 +1,7 @@
 """Frames of a video in groups, each of which ends with a frame to match; aligned, shot by shot."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from fractions import Fraction
 from itertools import islice
 from typing import NamedTuple
 
@@ -47,6 +48,7 @@ class FrameGrouper:
     ) -> None:
         self._aligner, self._last_grey = aligner, last_grey
         self.cuts = 0
+        self._first_times: set[Fraction] = set()
 
     def __call__(self, frames: Iterable[StereoFrame]) -> Iterator[FrameGroup]:
         """Yield the frames in groups. The last frame ends a group, so that it is matched in any case."""
@@ -59,6 +61,12 @@ class FrameGrouper:
                 continue
             for frame in several:
                 yield _make_group([self._begin(frame)])
+
+    def began_shot(self, frame: StereoFrame) -> bool:
+        """Return whether a frame that was yielded is the first one after a cut; true once for each."""
+        begins = frame.time in self._first_times
+        self._first_times.discard(frame.time)
+        return begins
 
     @property
     def has_warped(self) -> bool:
@@ -83,6 +91,7 @@ class FrameGrouper:
         grey = _make_thumbnail(frame)
         if self._last_grey is not None and self._begins_shot(grey):
             self.cuts += 1
+            self._first_times.add(frame.time)
             if self._aligner:
                 self._aligner.begin_shot()
         self._last_grey = grey

@@ -1,30 +1,17 @@
-"""Settings of a video conversion, and the rendering of its output frames."""
+"""Settings of a video conversion."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import isfinite
 
-import numpy as np
-from jaxtyping import Float, UInt16
-
-from stereoweave.errors import NameOf, Note, Remedy, StereoweaveError, keyword
-from stereoweave.io.colormap import colour_disparity
+from stereoweave.errors import NameOf, Remedy, StereoweaveError, keyword
 from stereoweave.matching.backend import Backend
-from stereoweave.rendering.fine_layouts import compose_fine, to_8_bits, to_16_bits
-from stereoweave.rendering.layouts import LAYOUTS, Eye, LayoutOptions, check_positions
-from stereoweave.rendering.renderer import Renderer
-from stereoweave.stereo import Estimate, StereoCamera, StereoPair
-from stereoweave.video.reader import FinePair
+from stereoweave.rendering.comfort import ScreenChoice
+from stereoweave.rendering.layouts import LAYOUTS, Eye, check_positions, check_shows_depth
 from stereoweave.video.sphere_output import WholeOutput
-from stereoweave.video.survey import Survey
-from stereoweave.video.writer import Picture
 
-_STEPS_PER_PX, _MOST_GREY16_PX = 256, 255.99
-# Black and white of a video in 10 bits.
-_BLACK_10, _WHITE_10 = 64, 940
 _BITS = 8, 10
 _TWO_LAYERS = "mvhevc"
-_NO_METRES = "no depth in metres, because frames were rectified"
 
 # Keys of the saved settings that identify the input and the version, and their names in error messages.
 _SAVED_FACTS = {"film": "video", "stereoweave": "stereoweave"}
@@ -47,6 +34,8 @@ class VideoJob:
         convergence_px: Disparity of the points that stay in the same column in all views. Default: the median
             disparity of the scene for layouts that overlay their views, 0 for all others.
         rectify: Whether to rectify the shots whose rows are apart, and to swap the sides if they are swapped.
+        screen: Screen that decides strength and convergence frame by frame, in their place; for layouts of
+            several views.
         whole: Output for the whole field of view of a VR180 or 360-degree video; None for a window.
         backend: Backend that matches the frames.
         name_of: Function that returns the front end's name for a setting, used in notes.
@@ -61,6 +50,7 @@ class VideoJob:
     strength: float = 1.0
     convergence_px: float | None = None
     rectify: bool = True
+    screen: ScreenChoice | None = None
     whole: WholeOutput | None = None
     backend: Backend = Backend()
     name_of: NameOf = keyword
@@ -89,6 +79,8 @@ class VideoJob:
             raise StereoweaveError(
                 f"expected one of {', '.join(LAYOUTS)}, found {self.layout!r}", setting="layout"
             )
+        if self.screen is not None:
+            check_shows_depth(self.layout or given[0])
         self._check_numbers(given[0] if self.layout is None else f"layout {self.layout}")
         self._check_bits(given[0])
         check_positions(self._positions, self.strength)
@@ -125,9 +117,9 @@ class VideoJob:
     @property
     def join(self) -> Callable[[Eye, Eye], Eye] | None:
         """Function that makes the output from the pictures of both cameras; None if it shows their depth."""
-        if self.strength != 1 or self.convergence_px:
+        if self.strength != 1 or self.convergence_px or self.screen:
             return None
-        join = self._arrangement
+        join = self.arrangement
         if self.position in (0, 1):
             join = _take_right if self.position else _take_left
         if join is None or self.whole is None:
@@ -138,56 +130,12 @@ class VideoJob:
     @property
     def is_fine(self) -> bool:
         """Whether output images are rendered from all bits of the frames, in the video's own colours."""
-        return self.bits > _BITS[0] and (self.position is not None or self._arrangement is not None)
+        return self.bits > _BITS[0] and (self.position is not None or self.arrangement is not None)
 
     @property
-    def _arrangement(self) -> Callable[[Eye, Eye], Eye] | None:
+    def arrangement(self) -> Callable[[Eye, Eye], Eye] | None:
+        """Function that arranges both eyes' views in the layout; None if it shows others, or mixes them."""
         return LAYOUTS[self.layout].join if self.layout else None
-
-    def render_fine_frame(self, fine: FinePair, estimate: Estimate, survey: Survey) -> Picture:
-        """Render the output image of one frame, in 16 bits, from its fine pictures."""
-        renderer = Renderer(
-            StereoPair(left=to_8_bits(fine[0]), right=to_8_bits(fine[1])),
-            estimate,
-            strength=self.strength,
-            convergence_px=self._find_plane_px(survey),
-            threads=self.backend.threads,
-            fine=fine,
-        )
-        if self._arrangement:
-            return compose_fine(renderer, self._arrangement)
-        return to_16_bits(renderer.fine_view(self.position or 0.0))
-
-    def render_frame(self, pair: StereoPair, estimate: Estimate, survey: Survey) -> Picture:
-        """Render the output image of one frame."""
-        if self.whole is None:
-            return self._render_pair(pair, estimate, survey)
-        seen = self.whole.measure_nearness(estimate) if self.depth else estimate
-        return self.whole.spread(self._render_pair(pair, seen, survey))
-
-    def _render_pair(self, pair: StereoPair, estimate: Estimate, survey: Survey) -> Picture:
-        if self.depth:
-            return colour_disparity(estimate.disparity_px, survey.range_px)
-        if self.depth10:
-            return _encode_grey10(estimate.disparity_px, survey.range_px)
-        if self.depth16:
-            return _encode_grey16(estimate.disparity_px)
-        renderer = Renderer(
-            pair,
-            estimate,
-            strength=self.strength,
-            convergence_px=self._find_plane_px(survey),
-            threads=self.backend.threads,
-        )
-        if self.position is not None:
-            return renderer.view(self.position).image
-        return LAYOUTS[str(self.layout)].compose(renderer, LayoutOptions(range_px=survey.range_px))
-
-    def _find_plane_px(self, survey: Survey) -> float:
-        """Return the disparity of the points that stay in the same column in all views."""
-        if self.convergence_px is not None:
-            return self.convergence_px
-        return survey.middle_px if self.layout and LAYOUTS[self.layout].converged else 0.0
 
     def name_of_saved(self, key: str) -> str:
         """Return the front end's name for a key in the saved settings."""
@@ -196,50 +144,6 @@ class VideoJob:
         setting = "format" if key == "arrangement" else key
         return self.name_of(setting) or setting
 
-    def find_losses(self, survey: Survey) -> list[Note]:
-        """Return a list that contains a note if the output format cannot represent all disparities."""
-        low_px, high_px = survey.range_px
-        if not self.depth16 or (low_px >= 0 and high_px <= _MOST_GREY16_PX):
-            return []
-        text = (
-            f"16-bit grey covers 0 to {_MOST_GREY16_PX} px; this video's disparities range from "
-            f"{low_px:.1f} to {high_px:.1f} px, so some are clipped"
-        )
-        return [Note(text, Remedy("show all of them in colours", ("depth",)))]
-
-    def describe_values(
-        self, survey: Survey, camera: StereoCamera | None = None, *, rectified: bool = False
-    ) -> dict[str, str]:
-        """Return metadata for the output file that explains how pixel values encode disparity.
-
-        With a camera, it also explains their depth in metres, or says that rectified frames have none: their
-        rectification turns the cameras, which shifts the disparity of infinitely far points.
-        """
-        ending = f"; {_NO_METRES}" if camera and rectified else ""
-        camera = None if rectified else camera
-        low_px, high_px = survey.range_px
-        if self.depth16:
-            text = f"16-bit grey: disparity of the left view in pixels = value / {_STEPS_PER_PX}"
-            if camera:
-                constant = camera.focal_px * camera.baseline_m * _STEPS_PER_PX
-                text += f"; depth in metres = {constant:.6g} / value"
-            return {"comment": text + ending}
-        if self.depth10:
-            step_px = (high_px - low_px) / (_WHITE_10 - _BLACK_10)
-            text = (
-                f"10-bit grey: disparity of the left view in pixels = {low_px:.4f} + {step_px:.7f} * "
-                f"(value - {_BLACK_10}), for values from {_BLACK_10} to {_WHITE_10}"
-            )
-            if camera:
-                text += f"; depth in metres = {camera.focal_px * camera.baseline_m:.6g} / disparity"
-            return {"comment": text + ending}
-        if self.depth:
-            low, high = (_describe_disparity(value_px, camera) for value_px in survey.range_px)
-            return {"comment": f"disparity of the left view: {low} is blue, {high} is red{ending}"}
-        if self.layout == "rgbd":
-            return {"comment": f"disparity in grey: {low_px:.2f} px is black, {high_px:.2f} px is white"}
-        return {}
-
 
 def _take_left(left: Eye, right: Eye) -> Eye:
     return left
@@ -247,24 +151,3 @@ def _take_left(left: Eye, right: Eye) -> Eye:
 
 def _take_right(left: Eye, right: Eye) -> Eye:
     return right
-
-
-def _describe_disparity(disparity_px: float, camera: StereoCamera | None) -> str:
-    text = f"{disparity_px:.2f} px"
-    if camera is None:
-        return text
-    depth_m = float(camera.depth_m(np.array([[disparity_px]]))[0, 0])
-    return f"{text} ({depth_m:.3g} m)" if isfinite(depth_m) else f"{text} (infinity)"
-
-
-def _encode_grey10(
-    disparity_px: Float[np.ndarray, "h w"], range_px: tuple[float, float]
-) -> UInt16[np.ndarray, "h w"]:
-    low_px, high_px = range_px
-    share = np.clip((disparity_px - low_px) / (high_px - low_px), 0, 1)
-    return np.rint(_BLACK_10 + (_WHITE_10 - _BLACK_10) * share).astype(np.uint16)
-
-
-def _encode_grey16(disparity_px: Float[np.ndarray, "h w"]) -> UInt16[np.ndarray, "h w"]:
-    # The value 0 is reserved for unknown, as in disparity.png.
-    return np.clip(np.rint(_STEPS_PER_PX * disparity_px), 1, 65535).astype(np.uint16)

@@ -65,6 +65,9 @@ def squeeze_job(job: VideoJob, size_px: tuple[int, int]) -> SqueezedJob:
         return SqueezedJob(job, None)
     full, axis = layout.squeezed
     squeezed = SqueezedJob(replace(job, layout=full), axis)
+    if job.screen and job.screen.convergence_px is not None:
+        screen = replace(job.screen, convergence_px=squeezed.scale * job.screen.convergence_px)
+        squeezed = squeezed._replace(job=replace(squeezed.job, screen=screen))
     if job.convergence_px is None:
         return squeezed
     moved_px = squeezed.scale * job.convergence_px

@@ -138,7 +138,7 @@ def _sample_frame(frame: StereoFrame, matcher: Matcher, *, rectified: bool, chec
     """Measure a frame; unless it is `checked` for problems, at a smaller size."""
     pair, scale = StereoPair(left=frame.left, right=frame.right), 1.0
     if not checked:
-        pair, scale = _scale_down(pair)
+        pair, scale = scale_down(pair)
     aligned = align(pair) if rectified else Aligned(pair=pair, alignment=check_pair(pair.left, pair.right))
     if scale > 1 and _is_flat(aligned):
         # At its own size, a shallow frame may differ from a flat one.
@@ -164,7 +164,7 @@ def _is_flat(aligned: Aligned) -> bool:
     return "same_picture" in aligned.alignment.defects
 
 
-def _scale_down(pair: StereoPair) -> tuple[StereoPair, float]:
+def scale_down(pair: StereoPair) -> tuple[StereoPair, float]:
     """Return the pair at a size that is soon matched, and its width divided by the new one."""
     height, width = pair.left.shape[:2]
     scale = width / fit_size(pair.left.shape, (_SURVEYED_WIDTH_PX, height))[0]
