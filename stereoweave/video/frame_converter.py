@@ -14,6 +14,7 @@ from stereoweave.stereo import Estimate
 from stereoweave.system.ahead import ahead
 from stereoweave.system.threads import thread_count
 from stereoweave.video.carried_frames import EstimatedFrame, carry_depth
+from stereoweave.video.converted_frames import ConvertedFrame
 from stereoweave.video.frame_groups import MATCHED_EVERY, FrameGroup, FrameGrouper
 from stereoweave.video.job import VideoJob
 from stereoweave.video.reader import StereoFrame, format_time
@@ -130,7 +131,9 @@ class FrameConverter:
     def _render(self, estimated: EstimatedFrame) -> tuple[Fraction, Picture]:
         frame, pair, estimate = estimated
         self.tally.add(frame)
-        return frame.time, self._squeezed.job.render_frame(pair, estimate, self._seen)
+        picture = self._squeezed.job.render_frame(pair, estimate, self._seen)
+        self._squeezed.job.on_converted(ConvertedFrame(frame, pair, estimate, picture, self._seen))
+        return frame.time, picture
 
     def _overlap(self, items: Iterable[Item], count: int) -> Iterator[Item]:
         """Compute items ahead of their use, if more than one thread is allowed."""

@@ -1,5 +1,6 @@
 """Settings of a video conversion, and the rendering of its output frames."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import isfinite
 
@@ -12,6 +13,7 @@ from stereoweave.matching.backend import Backend
 from stereoweave.rendering.layouts import LAYOUTS, LayoutOptions, check_positions
 from stereoweave.rendering.renderer import Renderer
 from stereoweave.stereo import Estimate, StereoCamera, StereoPair
+from stereoweave.video.converted_frames import ConvertedFrame, ignore
 from stereoweave.video.survey import Survey
 from stereoweave.video.writer import Picture
 
@@ -38,6 +40,8 @@ class VideoJob:
         rectify: Whether to rectify the shots whose rows are apart, and to swap the sides if they are swapped.
         backend: Backend that matches the frames.
         name_of: Function that returns the front end's name for a setting, used in notes.
+        on_converted: Function that is called with each converted frame, in a thread of the conversion, which
+            waits for it. An error that it raises ends the conversion.
     """
 
     depth: bool = False
@@ -49,6 +53,7 @@ class VideoJob:
     rectify: bool = True
     backend: Backend = Backend()
     name_of: NameOf = keyword
+    on_converted: Callable[[ConvertedFrame], None] = ignore
 
     def __post_init__(self) -> None:
         kinds = {
