@@ -45,7 +45,12 @@ class FramePictures:
 
 
 def make_pictures(
-    converted: "ConvertedFrame", output: str, job: "VideoJob | None", longer_side_px: int = _LONGER_SIDE_PX
+    converted: "ConvertedFrame",
+    output: str,
+    job: "VideoJob | None" = None,
+    *,
+    begin_s: float = 0.0,
+    longer_side_px: int = _LONGER_SIDE_PX,
 ) -> FramePictures:
     """Make small pictures of a converted frame.
 
@@ -53,16 +58,13 @@ def make_pictures(
         converted: The frame.
         output: What to show, a name in `OUTPUTS`.
         job: The job that renders this output; None if the frame was converted to it.
+        begin_s: Time at which the converted part of the video begins, in seconds.
         longer_side_px: The longer side of each picture.
     """
     fitted = longer_side_px, longer_side_px
     picture = converted.picture if job is None else _render_small(converted, job, fitted)
-    return FramePictures(
-        float(converted.frame.time),
-        output,
-        _encode(converted.frame.left, fitted),
-        _encode(picture, fitted),
-    )
+    time_s = begin_s + float(converted.frame.time)
+    return FramePictures(time_s, output, _encode(converted.frame.left, fitted), _encode(picture, fitted))
 
 
 class NewestFrame:
@@ -100,12 +102,11 @@ class NewestFrame:
             written_ns = self._file.stat().st_mtime_ns
             if written_ns == self._seen_ns:
                 return None
-            time_s, output, *jpegs = json.loads(self._file.read_text(encoding="utf-8"))
-        except OSError:
+            self._seen_ns = written_ns
+            time_s, output, left, made = json.loads(self._file.read_text(encoding="utf-8"))
+            return FramePictures(time_s, output, base64.b64decode(left), base64.b64decode(made))
+        except (OSError, ValueError, TypeError):  # a decoder that a file made crash may have written anything
             return None
-        self._seen_ns = written_ns
-        left, made = map(base64.b64decode, jpegs)
-        return FramePictures(time_s, output, left, made)
 
 
 class FrameShower:
@@ -116,12 +117,19 @@ class FrameShower:
     Args:
         newest: Where to show them.
         output: What the video is converted to.
-        make_job: Returns the job that makes a small picture of another output, or raises KeyError.
+        make_job: Function that returns the job for another output.
+        begin_s: Time at which the converted part of the video begins, in seconds.
     """
 
-    def __init__(self, newest: NewestFrame, output: str, make_job: "Callable[[str], VideoJob]") -> None:
+    def __init__(
+        self,
+        newest: NewestFrame,
+        output: str,
+        make_job: "Callable[[str], VideoJob]",
+        begin_s: float = 0.0,
+    ) -> None:
         self._newest, self._output, self._make_job = newest, output, make_job
-        self._next_s = 0.0
+        self._begin_s, self._next_s = begin_s, 0.0
 
     def __call__(self, converted: "ConvertedFrame") -> None:
         """Show a frame, unless another one was shown just before."""
@@ -136,7 +144,7 @@ class FrameShower:
     def _show(self, converted: "ConvertedFrame") -> None:
         output = self._newest.asked() or self._output
         job = None if output == self._output else self._make_job(output)
-        self._newest.write(make_pictures(converted, output, job))
+        self._newest.write(make_pictures(converted, output, job, begin_s=self._begin_s))
 
 
 def _render_small(

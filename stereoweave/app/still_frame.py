@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, replace
+from math import floor
 from typing import TYPE_CHECKING
 
 from rich.progress import Progress
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
 
 # Larger than the frames of a conversion, for which they must not cost much.
 _LONGER_SIDE_PX = 960
+_STEPS_PER_S = 10
 
 
 @dataclass(frozen=True)
@@ -22,8 +24,8 @@ class StillFrame:
     """A converted frame of a video.
 
     Attributes:
-        pictures: Small pictures of the frame; their time is that since the start of the video.
-        last_s: Time of the video's last frame, in seconds.
+        pictures: Small pictures of the frame.
+        last_s: Time of the video's last frame in seconds, rounded down to a tenth.
         notes: Notes on the video and the frame, in the form's words.
     """
 
@@ -50,9 +52,9 @@ def convert_still(upload: VideoUpload, report: Callable[[float, str], None]) -> 
     survey, notes = survey_video(still, load_matcher(job), Progress(disable=True), threads=1)
     with closing(FrameConverter(job, survey, still.size_px).convert(still.frames())) as converted:
         list(converted)
-    pictures = make_pictures(seen[0], upload.output, None, _LONGER_SIDE_PX)
+    last_s = float((video.frame_count - 1) * frame_s)
     return StillFrame(
-        replace(pictures, time_s=start_s),
-        float((video.frame_count - 1) * frame_s),
+        make_pictures(seen[0], upload.output, begin_s=start_s, longer_side_px=_LONGER_SIDE_PX),
+        floor(last_s * _STEPS_PER_S) / _STEPS_PER_S,
         [note.format(job.name_of) for note in notes],
     )

@@ -167,10 +167,13 @@ class VideoTab:
         made: ConvertedVideo | None = None
         self._newest[visitor] = newest
         try:
-            yield self._panel.begin(given[self._output])
+            yield (shown := self._panel.begin(given[self._output]))
             async with self._host.start(request, work) as job:
                 while not await job.is_done():
-                    yield {self._status: format_progress(job.share, job.what), **self._show_newest(newest)}
+                    said = {self._status: format_progress(job.share, job.what)}
+                    before, shown = shown, said | self._show_newest(newest)
+                    if shown != before:
+                        yield shown
                 made = job.task.result()
         except (StereoweaveError, OSError) as error:
             yield {self._status: self._wording.format_error(error), **self._panel.hide()}

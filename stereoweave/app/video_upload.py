@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -111,7 +112,7 @@ def convert_upload(upload: VideoUpload, folder: Path, report: Callable[[float, s
     video.on_frame = _FrameReport(video.frame_count, report)
     # Beside the conversion, one thread is enough for a small picture.
     make_small = partial(make_job, replace(upload, backend=replace(upload.backend, threads=1)))
-    shower = FrameShower(NewestFrame(folder), upload.output, make_small)
+    shower = FrameShower(NewestFrame(folder), upload.output, make_small, upload.start_s or 0.0)
     job = replace(make_job(upload, upload.output), on_converted=shower)
     console = _NoteConsole()
     out = _name_file(upload, video, folder)
@@ -155,7 +156,7 @@ def _check_upload(upload: VideoUpload) -> None:
             "expected one video that holds both views, found two videos; choose detected, or give one video",
             setting="format",
         )
-    if upload.start_s is not None and upload.start_s < 0:
+    if upload.start_s is not None and not 0 <= upload.start_s < inf:
         raise StereoweaveError(
             f"expected a time from 0 s, the start, found {upload.start_s:g} s", setting="start_s"
         )
