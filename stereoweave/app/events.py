@@ -1,6 +1,8 @@
 """Long work of the page as Gradio's events, which a button cancels and a closed tab ends."""
 
-from collections.abc import Sequence
+import asyncio
+from collections.abc import AsyncIterator, Sequence
+from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -19,6 +21,9 @@ LIFETIME_S = 3600
 MATCHING: dict[str, Any] = {"concurrency_id": "matching", "concurrency_limit": 2, "api_visibility": "private"}
 # One video at a time, beside the pictures, because a video takes minutes.
 VIDEOS: dict[str, Any] = {"concurrency_id": "videos", "concurrency_limit": 1, "api_visibility": "private"}
+# One frame of a video takes seconds, so it does not wait for another visitor's video.
+STILLS: dict[str, Any] = {"concurrency_id": "stills", "concurrency_limit": 1, "api_visibility": "private"}
+_LOOK_S = 0.2
 _CANCELLED = "Cancelled. Change what you like, and start again. A result below is from before."
 
 
@@ -33,6 +38,40 @@ class Host:
     async def work(self, request: gr.Request, work: Work[Done], progress: Any) -> Done:
         """Do a visitor's work in a process, and show its progress. Raises the errors of `Workers.run`."""
         return await self.workers.run(str(request.session_hash), work, partial(_show_progress, progress))
+
+    @asynccontextmanager
+    async def start(self, request: gr.Request, work: Work[Any]) -> AsyncIterator["Job"]:
+        """Do a visitor's work in a process during the block, at whose end it is stopped."""
+        job = Job()
+        job.task = asyncio.create_task(self.workers.run(str(request.session_hash), work, job.hear))
+        try:
+            yield job
+        finally:
+            job.task.cancel()
+            await asyncio.gather(job.task, return_exceptions=True)
+
+
+class Job:
+    """Work under way.
+
+    Attributes:
+        task: Task whose result is that of the work.
+        share, what: The finished share, from 0 to 1, and the name of the step.
+    """
+
+    task: asyncio.Task[Any]
+
+    def __init__(self) -> None:
+        self.share, self.what = 0.0, ""
+
+    def hear(self, share: float, what: str) -> None:
+        """Keep the progress of the work."""
+        self.share, self.what = share, what
+
+    async def is_done(self) -> bool:
+        """Wait for a short time, and return whether the work is done or has failed."""
+        await asyncio.wait([self.task], timeout=_LOOK_S)
+        return self.task.done()
 
 
 def connect_cancel(cancel: gr.Button, status: gr.HTML, events: Sequence[Any]) -> None:

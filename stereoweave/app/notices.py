@@ -47,6 +47,16 @@ def format_notice(lines: Sequence[str], *, problem: bool = False) -> str:
     return f'<div class="{look}" role="{role}">{format_paragraphs(lines)}</div>'
 
 
+def format_progress(share: float, what: str) -> str:
+    """Format how far a job is, from 0 to 1, as a bar below a line of text."""
+    percent = round(100 * share)
+    return (
+        f'<div class="working"><p>{html.escape(what)}</p><div role="progressbar" aria-label="Progress" '
+        f'aria-valuemin="0" aria-valuemax="100" aria-valuenow="{percent}">'
+        f'<span style="width:{percent}%"></span></div></div>'
+    )
+
+
 def format_warnings(lines: Sequence[str]) -> str:
     """Format warnings as a banner; nothing without warnings."""
     if not lines:

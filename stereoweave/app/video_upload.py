@@ -3,13 +3,16 @@
 import io
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.console import Console
 
+from stereoweave.app.newest_frame import FrameShower, NewestFrame
 from stereoweave.app.session import check_uploads
 from stereoweave.errors import FormatError, NameOf, StereoweaveError
 from stereoweave.io.animation import require_video_extra
@@ -21,6 +24,7 @@ from stereoweave.system.progress import format_duration
 
 if TYPE_CHECKING:
     from stereoweave.video.frame_converter import VideoTally
+    from stereoweave.video.job import VideoJob
     from stereoweave.video.reader import StereoVideo
 
 PREVIEW_S = 5
@@ -94,23 +98,22 @@ class ConvertedVideo:
 
 
 def convert_upload(upload: VideoUpload, folder: Path, report: Callable[[float, str], None]) -> ConvertedVideo:
-    """Convert an uploaded video, or a part of it; the result is written to `folder`.
+    """Convert an uploaded video, or a part of it; the result and its `NewestFrame` are written to `folder`.
 
     Raises:
-        StereoweaveError: See `open_video` and `convert_video`; or there is no video, or it has expired.
+        StereoweaveError: See `open_upload` and `convert_video`.
     """
-    _check_upload(upload)
-    with require_video_extra("a video"):
-        from stereoweave.video.convert import convert_video
-        from stereoweave.video.job import VideoJob
-        from stereoweave.video.reader import open_video
-    report(0.0, "opening the video")
-    video = open_video(upload.files, upload.format)
+    video = open_upload(upload, report)
+    from stereoweave.video.convert import convert_video
+
     whole_count = video.frame_count
     if upload.start_s is not None:
         video = video.excerpt(upload.start_s, PREVIEW_S)
     video.on_frame = _FrameReport(video.frame_count, report)
-    job = VideoJob(**OUTPUTS[upload.output].settings, backend=upload.backend, name_of=upload.name_of)
+    # Beside the conversion, one thread is enough for a small picture.
+    make_small = partial(make_job, replace(upload, backend=replace(upload.backend, threads=1)))
+    shower = FrameShower(NewestFrame(folder), upload.output, make_small, upload.start_s or 0.0)
+    job = replace(make_job(upload, upload.output), on_converted=shower)
     console = _NoteConsole()
     out = _name_file(upload, video, folder)
     tally = convert_video(video, upload.files, out, job, console)
@@ -119,6 +122,26 @@ def convert_upload(upload: VideoUpload, folder: Path, report: Callable[[float, s
         whole_s = whole_count / tally.frames_per_s
         summary += f" A preview has no sound. The whole video takes about {format_duration(whole_s)}."
     return ConvertedVideo(out, summary, [*console.lines, *_describe_problems(tally)])
+
+
+def open_upload(upload: VideoUpload, report: Callable[[float, str], None]) -> "StereoVideo":
+    """Open an uploaded video.
+
+    Raises:
+        StereoweaveError: See `open_video`; or there is no video, it has expired, or a setting does not fit.
+    """
+    _check_upload(upload)
+    with require_video_extra("a video"):
+        from stereoweave.video.reader import open_video
+    report(0.0, "opening the video")
+    return open_video(upload.files, upload.format)
+
+
+def make_job(upload: VideoUpload, output: str) -> "VideoJob":
+    """Return the job that makes an output, a name in `OUTPUTS`, of an uploaded video."""
+    from stereoweave.video.job import VideoJob
+
+    return VideoJob(**OUTPUTS[output].settings, backend=upload.backend, name_of=upload.name_of)
 
 
 def _check_upload(upload: VideoUpload) -> None:
@@ -133,7 +156,7 @@ def _check_upload(upload: VideoUpload) -> None:
             "expected one video that holds both views, found two videos; choose detected, or give one video",
             setting="format",
         )
-    if upload.start_s is not None and upload.start_s < 0:
+    if upload.start_s is not None and not 0 <= upload.start_s < inf:
         raise StereoweaveError(
             f"expected a time from 0 s, the start, found {upload.start_s:g} s", setting="start_s"
         )
@@ -182,11 +205,18 @@ class _FrameReport:
         if self._passes == 1:
             self._report(_SURVEY_SHARE * share, "looking through the video")
             return
-        spent_s = time.monotonic() - self._begin_s
-        left = number and f", about {format_duration(spent_s / number * (self._count - number))} left"
         self._report(
-            _SURVEY_SHARE + (1 - _SURVEY_SHARE) * share, f"frame {number + 1} of {self._count}{left or ''}"
+            _SURVEY_SHARE + (1 - _SURVEY_SHARE) * share,
+            f"frame {number + 1} of {self._count}{self._describe_speed(number)}",
         )
+
+    def _describe_speed(self, number: int) -> str:
+        """Describe the speed and the time left after this number of frames; nothing before the first."""
+        if not number:
+            return ""
+        frames_per_s = number / max(time.monotonic() - self._begin_s, 1e-9)
+        left = format_duration((self._count - number) / frames_per_s)
+        return f", {frames_per_s:.1f} frames/s, about {left} left"
 
 
 class _NoteConsole(Console):

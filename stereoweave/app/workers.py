@@ -17,7 +17,7 @@ Report = Callable[[float, str], None]
 Work = Callable[[Report], Done]
 
 # With the visitors' limits of the page, at most this many processes work at once.
-MOST_WORKERS = 3
+MOST_WORKERS = 4
 _POLL_S = 0.2
 
 

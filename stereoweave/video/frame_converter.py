@@ -18,6 +18,7 @@ from stereoweave.system.ahead import ahead
 from stereoweave.system.threads import thread_count
 from stereoweave.video.carried_frames import EstimatedFrame, carry_depth
 from stereoweave.video.comfort_path import ComfortPath
+from stereoweave.video.converted_frames import ConvertedFrame
 from stereoweave.video.frame_groups import MATCHED_EVERY, FrameGroup, FrameGrouper
 from stereoweave.video.frame_renderer import FrameRenderer
 from stereoweave.video.job import VideoJob
@@ -79,9 +80,9 @@ class FrameConverter:
     def __init__(self, job: VideoJob, survey: Survey, size_px: tuple[int, int]) -> None:
         self.survey, self.tally = survey, VideoTally()
         self._size_px, self._squeezed = size_px, squeeze_job(job, size_px)
-        seen = self._squeezed.squeeze_survey(survey)
-        self._options = MatchOptions(range_px=seen.match_range_px)
-        self._renderer = FrameRenderer(self._squeezed.job, seen)
+        self._seen = self._squeezed.squeeze_survey(survey)
+        self._options = MatchOptions(range_px=self._seen.match_range_px)
+        self._renderer = FrameRenderer(self._squeezed.job, self._seen)
         self._threads = thread_count(job.backend.threads)
         self._matcher = load_matcher(job)
         self._filter = TemporalFilter(job.backend.threads)
@@ -133,7 +134,8 @@ class FrameConverter:
         All frames are consumed before the iterator ends, so that `state` is complete.
         """
         groups = self._overlap(map(self._squeezed.squeeze, self._grouper(frames)), _GROUPS_AHEAD)
-        join = self._squeezed.job.join
+        # Whoever watches the conversion wants to see depth.
+        join = None if self._squeezed.job.on_converted else self._squeezed.job.join
         converted = self._convert_depth(groups) if join is None else self._join_views(groups, join)
         yield from self._overlap(converted, _PICTURES_AHEAD)
         self.tally.cuts = self._grouper.cuts
@@ -162,7 +164,10 @@ class FrameConverter:
         self.tally.add(frame)
         begins = self._grouper.began_shot(frame)
         comfort = self._comfort(estimate, frame.time, begins_shot=begins) if self._comfort else None
-        return frame.time, self._renderer(pair, estimate, frame.fine and frame.fine(), comfort)
+        picture = self._renderer(pair, estimate, frame.fine and frame.fine(), comfort)
+        if watch := self._squeezed.job.on_converted:
+            watch(ConvertedFrame(frame, pair, estimate, picture, self._seen))
+        return frame.time, picture
 
     def _overlap(self, items: Iterable[Item], count: int) -> Iterator[Item]:
         """Compute items ahead of their use, if more than one thread is allowed."""

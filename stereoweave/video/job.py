@@ -8,6 +8,7 @@ from stereoweave.errors import NameOf, Remedy, StereoweaveError, keyword
 from stereoweave.matching.backend import Backend
 from stereoweave.rendering.comfort import ScreenChoice
 from stereoweave.rendering.layouts import LAYOUTS, Eye, check_positions, check_shows_depth
+from stereoweave.video.converted_frames import ConvertedFrame
 from stereoweave.video.sphere_output import WholeOutput
 
 _BITS = 8, 10
@@ -39,6 +40,8 @@ class VideoJob:
         whole: Output for the whole field of view of a VR180 or 360-degree video; None for a window.
         backend: Backend that matches the frames.
         name_of: Function that returns the front end's name for a setting, used in notes.
+        on_converted: Function that is called with each converted frame, in a thread of the conversion, which
+            waits for it. An error that it raises ends the conversion.
     """
 
     depth: bool = False
@@ -54,6 +57,7 @@ class VideoJob:
     whole: WholeOutput | None = None
     backend: Backend = Backend()
     name_of: NameOf = keyword
+    on_converted: Callable[[ConvertedFrame], None] | None = None
 
     def __post_init__(self) -> None:
         kinds = {

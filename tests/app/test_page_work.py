@@ -80,10 +80,10 @@ def large_pair(tmp_path_factory) -> dict[str, Path]:
 
 @pytest.fixture(scope="module")
 def endless_video(tmp_path_factory) -> Path:
-    """Write a video of six minutes, whose conversion takes longer."""
+    """Write a video of 80 s, whose conversion takes longer than any test waits for it."""
     video = tmp_path_factory.mktemp("video") / "endless.mp4"
     frames = [packed(*pair) for pair in example_pairs(50)]
-    return write_video(video, frames * 180)
+    return write_video(video, frames * 40)
 
 
 def workers_of(pid: int) -> set[int]:
@@ -182,6 +182,62 @@ def test_a_waiting_job_can_be_cancelled(server, browser, endless_video):
         second.page.click("#video-cancel")
         second.page.locator("#video-status").get_by_text("Cancelled").wait_for()
         first.page.locator("#video-status").get_by_text(AT_WORK).wait_for()
+
+
+def test_the_newest_frame_is_shown_while_a_video_is_converted(server, browser, endless_video):
+    with visiting(browser, server[1]) as visit:
+        begin_endless(visit, endless_video, server[0])
+        left, made = wait_for_frame(visit)
+        assert (left[:12], made) == ("Left view at", "Depth in colour. Red is near, blue is far.")
+        visit.page.wait_for_function(
+            "before => document.querySelector('#video-frame figcaption').innerText !== before", arg=left
+        )
+        with visiting(browser, server[1]) as other:
+            other.open("Video")
+            assert other.page.locator("#video-frame img").count() == 0
+        visit.choose("video-shown-as", "Side by side")
+        visit.page.locator("#video-frame").get_by_text("For VR headsets").first.wait_for()
+        sizes = (
+            "[...document.querySelectorAll('#video-frame img')].map(i => i.naturalWidth / i.naturalHeight)"
+        )
+        assert visit.page.evaluate(sizes) == pytest.approx([160 / 96, 320 / 96])
+        status = visit.page.locator("#video-status")
+        assert re.search(
+            r"frame \d+ of 2000, \d+\.\d frames/s, about \d+ (s|min|h) left", status.inner_text()
+        )
+        visit.page.click("#video-cancel")
+        status.get_by_text("Cancelled").wait_for()
+        visit.page.locator("#video-frame").wait_for(state="hidden")
+        assert visit.refused == []
+
+
+def wait_for_frame(visit: Visit) -> list[str]:
+    """Wait for the pictures of a frame; return the lines below them."""
+    visit.page.locator("#video-frame img").nth(1).wait_for()
+    return visit.page.locator("#video-frame figcaption").all_inner_texts()
+
+
+def test_one_frame_is_shown_at_each_time_and_as_each_output(visit, tmp_path):
+    video = write_video(tmp_path / "video.mp4", [packed(*pair) for pair in example_pairs(50)])  # 2 s
+    visit.open("Video")
+    visit.give(video_left=video)
+    visit.page.click("#video-look")
+    assert wait_for_frame(visit) == ["Left view at 0:00.0", "Depth in colour. Red is near, blue is far."]
+    slider = visit.page.locator("#video-time input[type=range]")
+    assert slider.get_attribute("max") == "1.9"
+    slider.fill("1.5")
+    slider.dispatch_event("pointerup")
+    frame = visit.page.locator("#video-frame")
+    frame.get_by_text("Left view at 0:01.5").wait_for()
+    assert visit.page.locator("#video-start input").input_value() == "1.5"
+    visit.choose("video-output", "Anaglyph")
+    frame.get_by_text("Look through red-cyan glasses").wait_for()
+    frame.get_by_text("Left view at 0:01.5").wait_for()
+    visit.page.locator("#video-start input").fill("9")
+    visit.page.click("#video-look")
+    visit.page.locator("#video-status").get_by_text("found 9 s; choose an earlier one").wait_for()
+    assert not frame.is_visible()
+    assert visit.refused == []
 
 
 def test_a_job_cancelled_at_once_shows_no_error(visit, endless_video):
@@ -385,7 +441,7 @@ def test_a_video_s_frames_and_the_time_left_are_reported(tmp_path):
     shares, texts = zip(*said, strict=True)
     assert list(shares) == sorted(shares)
     assert texts[-4] == "frame 1 of 4"
-    assert re.fullmatch(r"frame 4 of 4, about \d+ (s|min|h) left", texts[-1])
+    assert re.fullmatch(r"frame 4 of 4, \d+\.\d frames/s, about \d+ (s|min|h) left", texts[-1])
     assert re.search(
         r"4 frames of 160×96 px, 0.2 s.*The whole video takes about \d+ (s|min|h)\.", made.summary
     )

@@ -618,3 +618,18 @@ def test_a_video_of_one_frame_is_converted_to_one_frame(tmp_path, capsys):
     video = write_side_by_side(tmp_path / "in.mp4", example_pairs(1), codec="libx264")
     assert run(video, tmp_path / "out.mp4", "--position", "0.5") == 0
     assert capsys.readouterr().out == f"{tmp_path / 'out.mp4'}: 1 frame\n"
+
+
+def test_each_converted_frame_is_shown_to_who_asks(tmp_path):
+    pairs = example_pairs(5)
+    source = write_side_by_side(tmp_path / "in.mp4", pairs)
+    seen = []
+    job = VideoJob(layout="side_by_side_half", backend=Backend(threads=1), on_converted=seen.append)
+    video = open_video([source], "side_by_side")
+    convert_video(video, [source], tmp_path / "out.mp4", job, Console(quiet=True))
+    assert [frame.time for frame, *_ in seen] == [Fraction(number, 25) for number in range(5)]
+    for converted, (left, _), written in zip(seen, pairs, rgb_of(tmp_path / "out.mp4"), strict=True):
+        assert np.abs(converted.frame.left - left.astype(float)).mean() < 3
+        assert converted.pair.left.shape == (96, 80, 3)
+        assert converted.estimate.disparity_px.shape == (96, 80)
+        assert np.abs(converted.picture - written.astype(float)).mean() < 4
