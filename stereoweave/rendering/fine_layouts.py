@@ -8,7 +8,7 @@ from jaxtyping import Float32, UInt16
 from stereoweave.rendering.layouts import squeeze
 from stereoweave.rendering.renderer import Renderer
 
-_LEVELS_OF_16_BITS = 65535 / 255
+_WHITE_16_BITS = 255 * 256
 
 
 class _Arrangement(NamedTuple):
@@ -29,15 +29,15 @@ FINE_LAYOUTS = {
 
 
 def compose_fine(renderer: Renderer, layout: str) -> UInt16[np.ndarray, "h w 3"]:
-    """Return a layout of both eyes' views, from 0 to 65535; `layout` is a name in `FINE_LAYOUTS`."""
+    """Return a layout of both eyes' views in 16 bits; `layout` is a name in `FINE_LAYOUTS`."""
     axis, right_first, squeezed = FINE_LAYOUTS[layout]
     eyes = [renderer.fine_view(position) for position in ((1.0, 0.0) if right_first else (0.0, 1.0))]
     return to_16_bits(np.concatenate([squeeze(eye, axis) for eye in eyes] if squeezed else eyes, axis))
 
 
 def to_16_bits(picture: Float32[np.ndarray, "h w 3"]) -> UInt16[np.ndarray, "h w 3"]:
-    """Return a picture from 0 to 255 as one from 0 to 65535."""
-    return np.clip(np.rint(_LEVELS_OF_16_BITS * picture), 0, 65535).astype(np.uint16)
+    """Return a picture from 0 to 255 as one from 0 to 65280, which FFmpeg takes for white."""
+    return np.clip(np.rint(_WHITE_16_BITS / 255 * picture), 0, _WHITE_16_BITS).astype(np.uint16)
 
 
 def to_8_bits(picture: Float32[np.ndarray, "h w 3"]) -> np.ndarray:
