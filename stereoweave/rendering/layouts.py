@@ -331,14 +331,15 @@ def write_picture(
         write_image(path, picture)
         return
     if ending == ".heic":
-        write_spatial_photo(Path(path), *np.split(picture, 2, axis=1), camera)
+        left, right = np.split(picture, 2, axis=1)
+        write_spatial_photo(Path(path), left, right, camera)
         return
     with replacing(path) as temporary, checking_format_size(path, picture.shape):
         if ending == ".jps":
             Image.fromarray(picture).save(temporary, "JPEG", extra=_JPS_SEGMENT, **_FINE)
         else:
-            left, right = (Image.fromarray(half) for half in np.split(picture, 2, axis=1))
-            left.save(temporary, "MPO", save_all=True, append_images=[right], **_FINE)
+            first, second = (Image.fromarray(half) for half in np.split(picture, 2, axis=1))
+            first.save(temporary, "MPO", save_all=True, append_images=[second], **_FINE)
 
 
 def _render_eyes(renderer: Renderer) -> list[UInt8[np.ndarray, "h w 3"]]:
