@@ -9,13 +9,13 @@ from stereoweave.rendering.floating_windows import cut_windows
 from stereoweave.rendering.layouts import Eye
 from stereoweave.rendering.renderer import Renderer
 
-_LEVELS_OF_16_BITS = 65535 / 255
+_WHITE_16_BITS = 255 * 256
 
 
 def compose_fine(
     renderer: Renderer, join: Callable[[Eye, Eye], Eye], windows_px: tuple[float, float] = (0.0, 0.0)
 ) -> UInt16[np.ndarray, "h w 3"]:
-    """Return a layout of both eyes' views, from 0 to 65535.
+    """Return a layout of both eyes' views in 16 bits.
 
     Args:
         renderer: Renderer with fine images.
@@ -27,8 +27,8 @@ def compose_fine(
 
 
 def to_16_bits(picture: Float32[np.ndarray, "h w 3"]) -> UInt16[np.ndarray, "h w 3"]:
-    """Return a picture from 0 to 255 as one from 0 to 65535."""
-    return np.clip(np.rint(_LEVELS_OF_16_BITS * picture), 0, 65535).astype(np.uint16)
+    """Return a picture from 0 to 255 as one from 0 to 65280, which FFmpeg takes for white."""
+    return np.clip(np.rint(_WHITE_16_BITS / 255 * picture), 0, _WHITE_16_BITS).astype(np.uint16)
 
 
 def to_8_bits(picture: Float32[np.ndarray, "h w 3"]) -> np.ndarray:

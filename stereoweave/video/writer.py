@@ -127,7 +127,7 @@ class Recorder:
     def write_part(self, path: Path, pictures: Iterable[tuple[Fraction, Picture]]) -> None:
         """Write images of the same size, each with its time in seconds, to a NUT file.
 
-        Colours of 16 bits reach from 0 to 65535; grey is written as it is, in 10 or 16 bits. H.264 and HEVC
+        Colours of 16 bits reach from 0 to 65280; grey is written as it is, in 10 or 16 bits. H.264 and HEVC
         halve the colour resolution, so an odd size is padded by repeating the last row or column.
         """
         with av.open(str(path), "w", format="nut") as part:
@@ -229,7 +229,7 @@ class Recorder:
         if self.encoding.pixel_format == GREY16.pixel_format:
             return VideoFrame.from_ndarray(picture.astype(np.uint16, copy=False), GREY16.pixel_format)
         height, width = picture.shape[:2]
-        even = cv2.copyMakeBorder(picture, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
+        even: Any = cv2.copyMakeBorder(picture, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
         if even.ndim == 2:
             # FFmpeg would take grey for full range, and convert it.
             colourless = np.full((even.shape[0] // 2, even.shape[1]), _NO_COLOUR_10, np.uint16)
