@@ -172,7 +172,7 @@ def read_side_data(frame: "av.VideoFrame") -> Any:
 
 
 def _is_panorama(spherical: Any) -> bool:
-    return spherical is not None and np.frombuffer(bytes(spherical), np.int32, 1)[0] != _RECTILINEAR
+    return spherical is not None and bool(np.frombuffer(bytes(spherical), np.int32, 1)[0] != _RECTILINEAR)
 
 
 def _filtered(frame: "av.VideoFrame", *steps: str) -> list["av.VideoFrame"]:

@@ -11,14 +11,14 @@ import numpy as np
 
 from stereoweave.cameras.spherical import EQUIRECTANGULAR, FISHEYE, HALF, Projection
 from stereoweave.errors import FormatError, StereoweaveError
-from stereoweave.video.spatial import parse_stereo3d, read_side_data
+from stereoweave.video.spatial import Stereo3D, parse_stereo3d, read_side_data
 
 if TYPE_CHECKING:
     import av
 
 # FFmpeg's AVSphericalProjection; cubemaps are 1, parametric ones 6.
-_NAMES = {0: EQUIRECTANGULAR, 2: EQUIRECTANGULAR, 3: HALF, 5: FISHEYE}
-_RECTILINEAR = 4
+_TILE, _RECTILINEAR = 2, 4
+_NAMES = {0: EQUIRECTANGULAR, _TILE: EQUIRECTANGULAR, 3: HALF, 5: FISHEYE}
 _KINDS = {1: "a cubemap", 6: "Apple's parametric projection of immersive video"}
 # AVSphericalMapping: projection, yaw, pitch, roll, and the bounds in 0.32 bits: left, top, right, bottom.
 _MAPPING_BYTES = 32
@@ -51,10 +51,13 @@ def read_sphere(name: str, frame: "av.VideoFrame") -> SphereMark | None:
             f"{name}: expected an equirectangular or fisheye video, found "
             f"{_KINDS.get(kind, 'an unknown projection')}; convert it to an equirectangular one first"
         )
-    said = parse_stereo3d(side_data.get(Type.STEREO3D, b""))
-    baseline_m = said.baseline_m if said and said.baseline_m > 0 else None
-    if kind != 2:
-        lens_deg = said.field_of_view_deg if said and _NAMES[kind] == FISHEYE else 0.0
+    # The container's word on cameras comes first, and that of the stream, which knows of none, behind it.
+    every = [side_data[index] for index in range(len(side_data))]
+    cameras = [parse_stereo3d(data) for data in every if data.type == Type.STEREO3D]
+    said = next((camera for camera in cameras if camera), Stereo3D())
+    baseline_m = said.baseline_m or None
+    if kind != _TILE:
+        lens_deg = said.field_of_view_deg if _NAMES[kind] == FISHEYE else 0.0
         return SphereMark(_name_projection(name, _NAMES[kind], lens_deg or 180.0), baseline_m)
     left, top, right, bottom = (np.frombuffer(content, np.uint32, 4, 16) / 2**32).tolist()
     half_deg = 180 * (1 - left - right)
