@@ -7,7 +7,7 @@ from typing import Any
 from PIL import Image
 from PIL.ExifTags import Base
 
-from stereoweave.errors import FormatError, StereoweaveError, reason, require_extra
+from stereoweave.errors import FormatError, Remedy, StereoweaveError, require_extra
 
 ENDINGS = frozenset(
     {
@@ -20,6 +20,7 @@ FORMAT = "RAW"
 _SRGB_CURVE = (2.4, 12.92)
 # LibRaw's turns by a quarter have this bit.
 _QUARTER_TURN = 4
+_LAST_ROWS_SHARE = 32
 
 
 class RawImage(Image.Image):
@@ -47,6 +48,8 @@ class RawImage(Image.Image):
             FormatError: The file is damaged.
         """
         if not self._is_loaded:
+            _calling_libraw(self._path, self._raw.unpack)
+            self._check_complete()
             # Brightening each picture by its own histogram, as is usual, would make the two views unlike.
             pixels = _calling_libraw(
                 self._path,
@@ -55,6 +58,19 @@ class RawImage(Image.Image):
             developed = Image.fromarray(pixels)
             self.im, self._size, self._is_loaded = developed.im, developed.size, True
         return super().load()
+
+    def _check_complete(self) -> None:
+        """Raise a FormatError if the last rows are empty: LibRaw reads a file that was cut off to its end."""
+        import rawpy
+
+        if self._raw.raw_type != rawpy.RawType.Flat:
+            return
+        rows = self._raw.raw_image
+        if not rows[-max(len(rows) // _LAST_ROWS_SHARE, 1) :].any():
+            raise FormatError(
+                f"{self._path}: expected a picture, found a camera raw file whose last rows are empty",
+                remedy=Remedy("copy it again"),
+            )
 
     def getexif(self) -> Image.Exif:
         """Return the tags of the file or, if it is no TIFF file, of its preview, without an orientation."""
@@ -95,8 +111,8 @@ def _calling_libraw(path: Path, call: Any) -> Any:
     try:
         return call()
     except rawpy.LibRawError as error:
-        words = error.args[0] if error.args else b""
-        said = words.decode(errors="replace") if isinstance(words, bytes) else reason(error)
+        words = error.args[0] if error.args else ""
+        said = words.decode(errors="replace") if isinstance(words, bytes) else str(words)
         raise FormatError(
             f"{path}: expected a picture, found a camera raw file that LibRaw cannot read ({said}); "
             "convert it to DNG, TIFF or JPEG"
