@@ -1,6 +1,5 @@
 """Camera raw files, which rawpy (LibRaw) develops: colours, size and orientation."""
 
-import io
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,7 @@ FORMAT = "RAW"
 _SRGB_CURVE = (2.4, 12.92)
 # LibRaw's turns by a quarter have this bit.
 _QUARTER_TURN = 4
+_EXIF, _LONGEST_SEGMENT = b"Exif\0\0", 65_533  # of a JPEG
 _LAST_ROWS_SHARE = 32
 
 
@@ -79,8 +79,9 @@ class RawImage(Image.Image):
             with self._path.open("rb") as file:
                 tags.load_from_fp(file)
         except SyntaxError:  # the file is no TIFF
-            with Image.open(io.BytesIO(self._raw.extract_thumb().data), formats=["JPEG"]) as preview:
-                tags = preview.getexif()
+            preview = bytes(self._raw.extract_thumb().data)
+            start = preview.index(_EXIF)
+            tags.load(preview[start : start + _LONGEST_SEGMENT])
         tags.pop(Base.Orientation, None)
         return tags
 
