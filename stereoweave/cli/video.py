@@ -36,8 +36,9 @@ Videos = Annotated[
     list[Path],
     typer.Argument(
         metavar="VIDEO",
-        help="Stereo video with both views in each frame, spatial video (MV-HEVC), or LEFT RIGHT. Each is a "
-        "video file, a folder of pictures, or a quoted pattern such as 'left/*.png'.",
+        help="Stereo video with both views in each frame, in two streams or in turn, spatial video "
+        "(MV-HEVC), or LEFT RIGHT. Each is a video file, a folder of pictures, or a quoted pattern such as "
+        "'left/*.png'.",
     ),
 ]
 Out = Annotated[
@@ -98,8 +99,8 @@ Format = Annotated[
     str | None,
     typer.Option(
         "--format",
-        help="Frame packing, such as side_by_side, top_bottom_half or crossed (default: detected). An "
-        "unknown name lists them all.",
+        help="Frame packing, such as side_by_side, top_bottom_half, crossed or frame_sequential (default: "
+        "detected). An unknown name lists them all.",
     ),
 ]
 Rate = Annotated[

@@ -1,13 +1,12 @@
 """Camera raw files, which rawpy (LibRaw) develops: colours, size and orientation."""
 
-import io
 from pathlib import Path
 from typing import Any
 
 from PIL import Image
 from PIL.ExifTags import Base
 
-from stereoweave.errors import FormatError, StereoweaveError, reason, require_extra
+from stereoweave.errors import FormatError, Remedy, StereoweaveError, require_extra
 
 ENDINGS = frozenset(
     {
@@ -20,6 +19,8 @@ FORMAT = "RAW"
 _SRGB_CURVE = (2.4, 12.92)
 # LibRaw's turns by a quarter have this bit.
 _QUARTER_TURN = 4
+_EXIF, _LONGEST_SEGMENT = b"Exif\0\0", 65_533  # of a JPEG
+_LAST_ROWS_SHARE = 32
 
 
 class RawImage(Image.Image):
@@ -47,6 +48,8 @@ class RawImage(Image.Image):
             FormatError: The file is damaged.
         """
         if not self._is_loaded:
+            _calling_libraw(self._path, self._raw.unpack)
+            self._check_complete()
             # Brightening each picture by its own histogram, as is usual, would make the two views unlike.
             pixels = _calling_libraw(
                 self._path,
@@ -56,6 +59,19 @@ class RawImage(Image.Image):
             self.im, self._size, self._is_loaded = developed.im, developed.size, True
         return super().load()
 
+    def _check_complete(self) -> None:
+        """Raise a FormatError if the last rows are empty: LibRaw reads a file that was cut off to its end."""
+        import rawpy
+
+        if self._raw.raw_type != rawpy.RawType.Flat:
+            return
+        rows = self._raw.raw_image
+        if not rows[-max(len(rows) // _LAST_ROWS_SHARE, 1) :].any():
+            raise FormatError(
+                f"{self._path}: expected a picture, found a camera raw file whose last rows are empty",
+                remedy=Remedy("copy it again"),
+            )
+
     def getexif(self) -> Image.Exif:
         """Return the tags of the file or, if it is no TIFF file, of its preview, without an orientation."""
         tags = Image.Exif()
@@ -63,8 +79,9 @@ class RawImage(Image.Image):
             with self._path.open("rb") as file:
                 tags.load_from_fp(file)
         except SyntaxError:  # the file is no TIFF
-            with Image.open(io.BytesIO(self._raw.extract_thumb().data), formats=["JPEG"]) as preview:
-                tags = preview.getexif()
+            preview = bytes(self._raw.extract_thumb().data)
+            start = preview.index(_EXIF)
+            tags.load(preview[start : start + _LONGEST_SEGMENT])
         tags.pop(Base.Orientation, None)
         return tags
 
@@ -95,8 +112,8 @@ def _calling_libraw(path: Path, call: Any) -> Any:
     try:
         return call()
     except rawpy.LibRawError as error:
-        words = error.args[0] if error.args else b""
-        said = words.decode(errors="replace") if isinstance(words, bytes) else reason(error)
+        words = error.args[0] if error.args else ""
+        said = words.decode(errors="replace") if isinstance(words, bytes) else str(words)
         raise FormatError(
             f"{path}: expected a picture, found a camera raw file that LibRaw cannot read ({said}); "
             "convert it to DNG, TIFF or JPEG"

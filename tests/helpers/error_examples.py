@@ -14,7 +14,8 @@ from stereoweave.stereo import StereoPair
 TEXTURED = Path(__file__).resolve().parents[1] / "textured_pair"
 LAYOUTS = (
     "side_by_side, side_by_side_half, top_bottom, top_bottom_half, crossed, crossed_half, "
-    "top_bottom_right_first, top_bottom_right_first_half"
+    "top_bottom_right_first, top_bottom_right_first_half, row_interleaved, column_interleaved, checkerboard, "
+    "row_interleaved_right_first, column_interleaved_right_first, checkerboard_right_first"
 )
 
 
