@@ -27,6 +27,8 @@ _CONFIDENT = 0.5
 _BLACK_LEVEL, _WHITE_LEVEL, _LEAST_PIXELS = 8, 250, 200
 _GAMMA = 2.2
 _TOLERATED_COLOUR_STOPS = 0.3
+# A column is black if no level is above this; compression makes black bars uneven.
+_BLACKEST_LEVEL, _TOLERATED_CUT_PX = 24, 1.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,7 +87,7 @@ def check_frame(frame: StereoFrame, matcher: Matcher) -> FrameCheck:
         larger_percent=100 * (alignment.scale - 1),
         exposure_stops=exposure_stops,
         colour_stops=colour_stops,
-        windows_px=_find_cut_px(alignment, estimate, scale),
+        windows_px=_find_cut_px(alignment, pair, estimate, scale),
         defects=tuple(defects),
     )
 
@@ -139,8 +141,27 @@ def _find_depth(alignment: Alignment, estimate: Estimate, scale: float) -> Depth
     return found and Depth(*(scale * px for px in found))
 
 
-def _find_cut_px(alignment: Alignment, estimate: Estimate, scale: float) -> tuple[float, float]:
+def measure_bars(pair: StereoPair) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Return the widths in px of the black bars at the left and at the right border, of both images."""
+    bars = []
+    for image in (pair.left, pair.right):
+        bright = np.flatnonzero(image.max((0, 2)) > _BLACKEST_LEVEL)
+        ends = (int(bright[0]), image.shape[1] - 1 - int(bright[-1])) if len(bright) else (0, 0)
+        bars.append(ends)
+    return bars[0], bars[1]
+
+
+def _find_cut_px(
+    alignment: Alignment, pair: StereoPair, estimate: Estimate, scale: float
+) -> tuple[float, float]:
     if "same_picture" in alignment.defects:
         return 0.0, 0.0
     left_px, right_px = find_windows_px(estimate, strength=1.0, convergence_px=0.0)
+    bars = measure_bars(pair)
+    # A bar of one eye, a floating window, brings the border forward by its width.
+    windows_px = max(bars[0][0] - bars[1][0], 0), max(bars[1][1] - bars[0][1], 0)
+    left_px, right_px = (
+        0.0 if px <= window_px + _TOLERATED_CUT_PX else px
+        for px, window_px in zip((left_px, right_px), windows_px, strict=True)
+    )
     return scale * left_px, scale * right_px
