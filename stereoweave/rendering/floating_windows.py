@@ -11,6 +11,7 @@ import math
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from stereoweave.rendering.comfort import CONFIDENT, find_grid
 from stereoweave.stereo import Estimate
 
 # Columns at each border that are looked at, in percent of the picture's width, but at least two columns.
@@ -20,7 +21,7 @@ _LEAST_PERCENT = 0.2
 # An object must reach the border in this share of the rows.
 _LEAST_ROWS_SHARE = 0.02
 _WIDEST_PERCENT = 6.0
-_CONFIDENT, _NEAREST_PERCENT = 0.5, 0.2
+_NEAREST_PERCENT = 0.2
 
 
 def find_windows_px(estimate: Estimate, *, strength: float, convergence_px: float) -> tuple[float, float]:
@@ -56,10 +57,11 @@ def _find_nearest_px(estimate: Estimate) -> float:
 
     At the borders, only one camera sees the scene, and disparities may be wrong.
     """
-    sure = (estimate.confidence >= _CONFIDENT) & ~estimate.occluded
+    grid = find_grid(estimate)
+    sure = (estimate.confidence[grid] >= CONFIDENT) & ~estimate.occluded[grid]
     if not sure.any():
         return math.inf
-    return float(np.percentile(estimate.disparity_px[sure], 100 - _NEAREST_PERCENT))
+    return float(np.percentile(estimate.disparity_px[grid][sure], 100 - _NEAREST_PERCENT))
 
 
 def _find_bar_px(disparity_px: Float[np.ndarray, "h w"], strength: float, convergence_px: float) -> float:

@@ -11,7 +11,7 @@ from stereoweave.cameras.alignment import Alignment, check_pair
 from stereoweave.cameras.auto_align import align
 from stereoweave.matching.estimate import match
 from stereoweave.matching.matcher import Matcher
-from stereoweave.rendering.comfort import Depth, measure_depth
+from stereoweave.rendering.comfort import CONFIDENT, Depth, measure_depth
 from stereoweave.rendering.floating_windows import find_windows_px
 from stereoweave.stereo import Estimate, StereoPair
 from stereoweave.video.reader import StereoFrame
@@ -22,7 +22,6 @@ _NAN = float("nan")
 _NO_DEFECTS = ("negative_disparity", "too_few_matches")
 # An eye is empty if its levels vary by at most this much and the other eye's by at least that much.
 _EMPTY_LEVELS, _FILLED_LEVELS = 3.0, 8.0
-_CONFIDENT = 0.5
 # Levels that neither image clips, and the fewest pixels for a comparison of colours.
 _BLACK_LEVEL, _WHITE_LEVEL, _LEAST_PIXELS = 8, 250, 200
 _GAMMA = 2.2
@@ -107,7 +106,7 @@ def measure_gains(pair: StereoPair, estimate: Estimate) -> Float[np.ndarray, " 3
 
     It is compared at the confident pixels that no image clips; None if they are too few.
     """
-    rows, columns = np.nonzero((estimate.confidence >= _CONFIDENT) & ~estimate.occluded)
+    rows, columns = np.nonzero((estimate.confidence >= CONFIDENT) & ~estimate.occluded)
     there = np.rint(columns - estimate.disparity_px[rows, columns]).astype(int)
     inside = (there >= 0) & (there < pair.left.shape[1])
     rows, columns, there = rows[inside], columns[inside], there[inside]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from film_examples import SHIP, WIDTH, box_at_the_left_border, faulty_film, shot_of
+from faulty_video_examples import SHIP, WIDTH, box_at_the_left_border, faulty_film, shot_of
 from PIL import Image
 from rich.progress import Progress
 from video_examples import TEXTURED, example_pairs, flat_pairs, truncate, write_side_by_side, write_video

@@ -8,7 +8,7 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
-from film_examples import box_at_the_left_border, shot_of
+from faulty_video_examples import box_at_the_left_border, shot_of
 from video_examples import TEXTURED, example_pairs, flat_pairs, truncate, write_side_by_side
 
 from stereoweave.cli.root import main
