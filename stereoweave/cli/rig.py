@@ -11,7 +11,6 @@ from typing import Annotated
 import typer
 
 from stereoweave.cli.commands import running_options, shows_steps
-from stereoweave.cli.film_check import check_film, is_video, refuse_film_options
 from stereoweave.cli.options import (
     AsJson,
     Calib,
@@ -24,6 +23,7 @@ from stereoweave.cli.options import (
     make_parent_folder,
     make_sphere_request,
 )
+from stereoweave.cli.video_check import is_video, print_video_check, refuse_video_options
 from stereoweave.errors import FormatError, Note, StereoweaveError
 from stereoweave.system.steps import step
 
@@ -85,9 +85,9 @@ def check(  # noqa: PLR0913 - each is an option of the command line
             raise
         opened = None
     if opened is None:
-        check_film(open_video(pictures, format, sphere=sphere), screen, timeline, as_json)
+        print_video_check(open_video(pictures, format, sphere=sphere), screen, timeline, as_json)
         return
-    refuse_film_options(screen, timeline)
+    refuse_video_options(screen, timeline)
     with step("checking the pair"):
         found = check_pair(opened.pair.left, opened.pair.right)
     lines = _advise_once(found.lines())

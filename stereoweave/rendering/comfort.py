@@ -27,7 +27,7 @@ from stereoweave.arguments import check_kind, check_number
 from stereoweave.errors import StereoweaveError
 from stereoweave.stereo import Estimate
 
-_CONFIDENT = 0.5
+CONFIDENT = 0.5
 # Fewer confident pixels than this do not show a scene's range.
 _LEAST_CONFIDENT_SHARE = 0.02
 _OUTER_PERCENT = 1.0
@@ -186,17 +186,17 @@ def measure_depth(estimate: Estimate) -> Depth | None:
 
     Occluded pixels do not count. None if there are too few confident ones, as in a black frame.
     """
-    step = _find_step(estimate)
-    sure = (estimate.confidence[step] >= _CONFIDENT) & ~estimate.occluded[step]
+    grid = find_grid(estimate)
+    sure = (estimate.confidence[grid] >= CONFIDENT) & ~estimate.occluded[grid]
     if sure.mean() < _LEAST_CONFIDENT_SHARE:
         return None
-    return _take_percentiles(estimate.disparity_px[step][sure])
+    return _take_percentiles(estimate.disparity_px[grid][sure])
 
 
 def measure_any_depth(estimate: Estimate) -> Depth:
     """Return the disparities of a scene as `measure_depth` does; of all pixels if too few are confident."""
     found = measure_depth(estimate)
-    return found or _take_percentiles(estimate.disparity_px[_find_step(estimate)].ravel())
+    return found or _take_percentiles(estimate.disparity_px[find_grid(estimate)].ravel())
 
 
 def fit_depth(
@@ -257,8 +257,8 @@ def _find_convergence_px(depth: Depth, budget_px: tuple[float, float], strength:
     return depth.far_px + (depth.near_px - depth.far_px) * behind_px / (front_px + behind_px)
 
 
-def _find_step(estimate: Estimate) -> tuple[slice, slice]:
-    """Return the rows and columns of a grid of pixels."""
+def find_grid(estimate: Estimate) -> tuple[slice, slice]:
+    """Return the rows and columns of a grid of about 40,000 pixels."""
     step = max(1, int((estimate.disparity_px.size / _SAMPLED_PIXELS) ** 0.5))
     return slice(step // 2, None, step), slice(step // 2, None, step)
 

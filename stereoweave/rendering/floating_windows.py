@@ -6,9 +6,12 @@ view, or at the right border of the right eye's view, as wide as the object's pa
 the picture forward to the object. Source: B. Mendiburu, "3D Movie Making", 2009.
 """
 
+import math
+
 import numpy as np
 from jaxtyping import Float, Num
 
+from stereoweave.rendering.comfort import CONFIDENT, find_grid
 from stereoweave.stereo import Estimate
 
 # Columns at each border that are looked at, in percent of the picture's width, but at least two columns.
@@ -18,6 +21,7 @@ _LEAST_PERCENT = 0.2
 # An object must reach the border in this share of the rows.
 _LEAST_ROWS_SHARE = 0.02
 _WIDEST_PERCENT = 6.0
+_NEAREST_PERCENT = 0.2
 
 
 def find_windows_px(estimate: Estimate, *, strength: float, convergence_px: float) -> tuple[float, float]:
@@ -31,7 +35,8 @@ def find_windows_px(estimate: Estimate, *, strength: float, convergence_px: floa
     left = _find_bar_px(estimate.disparity_px, strength, convergence_px)
     # The right view's own disparities, mirrored, so that its right border is the first column.
     right = _find_bar_px(estimate.right_disparity_px[:, ::-1], strength, convergence_px)
-    return left, right
+    most_px = max(strength * (_find_nearest_px(estimate) - convergence_px), 0.0)
+    return min(left, most_px), min(right, most_px)
 
 
 def cut_windows(
@@ -45,6 +50,18 @@ def cut_windows(
     if windows_px[1] > 0:
         cut[1] = np.ascontiguousarray(_blacken(right[:, ::-1], windows_px[1])[:, ::-1])
     return cut
+
+
+def _find_nearest_px(estimate: Estimate) -> float:
+    """Return the disparity of the nearest confident pixels; infinity if there are none.
+
+    At the borders, only one camera sees the scene, and disparities may be wrong.
+    """
+    grid = find_grid(estimate)
+    sure = (estimate.confidence[grid] >= CONFIDENT) & ~estimate.occluded[grid]
+    if not sure.any():
+        return math.inf
+    return float(np.percentile(estimate.disparity_px[grid][sure], 100 - _NEAREST_PERCENT))
 
 
 def _find_bar_px(disparity_px: Float[np.ndarray, "h w"], strength: float, convergence_px: float) -> float:

@@ -11,7 +11,7 @@ from stereoweave.cameras.alignment import Alignment, check_pair
 from stereoweave.cameras.auto_align import align
 from stereoweave.matching.estimate import match
 from stereoweave.matching.matcher import Matcher
-from stereoweave.rendering.comfort import Depth, measure_depth
+from stereoweave.rendering.comfort import CONFIDENT, Depth, measure_depth
 from stereoweave.rendering.floating_windows import find_windows_px
 from stereoweave.stereo import Estimate, StereoPair
 from stereoweave.video.reader import StereoFrame
@@ -22,11 +22,12 @@ _NAN = float("nan")
 _NO_DEFECTS = ("negative_disparity", "too_few_matches")
 # An eye is empty if its levels vary by at most this much and the other eye's by at least that much.
 _EMPTY_LEVELS, _FILLED_LEVELS = 3.0, 8.0
-_CONFIDENT = 0.5
 # Levels that neither image clips, and the fewest pixels for a comparison of colours.
 _BLACK_LEVEL, _WHITE_LEVEL, _LEAST_PIXELS = 8, 250, 200
 _GAMMA = 2.2
 _TOLERATED_COLOUR_STOPS = 0.3
+# A column is black if no level is above this; compression makes black bars uneven.
+_BLACKEST_LEVEL, _TOLERATED_CUT_PX = 24, 1.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,7 +86,7 @@ def check_frame(frame: StereoFrame, matcher: Matcher) -> FrameCheck:
         larger_percent=100 * (alignment.scale - 1),
         exposure_stops=exposure_stops,
         colour_stops=colour_stops,
-        windows_px=_find_cut_px(alignment, estimate, scale),
+        windows_px=_find_cut_px(alignment, pair, estimate, scale),
         defects=tuple(defects),
     )
 
@@ -105,7 +106,7 @@ def measure_gains(pair: StereoPair, estimate: Estimate) -> Float[np.ndarray, " 3
 
     It is compared at the confident pixels that no image clips; None if they are too few.
     """
-    rows, columns = np.nonzero((estimate.confidence >= _CONFIDENT) & ~estimate.occluded)
+    rows, columns = np.nonzero((estimate.confidence >= CONFIDENT) & ~estimate.occluded)
     there = np.rint(columns - estimate.disparity_px[rows, columns]).astype(int)
     inside = (there >= 0) & (there < pair.left.shape[1])
     rows, columns, there = rows[inside], columns[inside], there[inside]
@@ -139,8 +140,27 @@ def _find_depth(alignment: Alignment, estimate: Estimate, scale: float) -> Depth
     return found and Depth(*(scale * px for px in found))
 
 
-def _find_cut_px(alignment: Alignment, estimate: Estimate, scale: float) -> tuple[float, float]:
+def measure_bars(pair: StereoPair) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Return the widths in px of the black bars at the left and at the right border, of both images."""
+    bars = []
+    for image in (pair.left, pair.right):
+        bright = np.flatnonzero(image.max((0, 2)) > _BLACKEST_LEVEL)
+        ends = (int(bright[0]), image.shape[1] - 1 - int(bright[-1])) if len(bright) else (0, 0)
+        bars.append(ends)
+    return bars[0], bars[1]
+
+
+def _find_cut_px(
+    alignment: Alignment, pair: StereoPair, estimate: Estimate, scale: float
+) -> tuple[float, float]:
     if "same_picture" in alignment.defects:
         return 0.0, 0.0
     left_px, right_px = find_windows_px(estimate, strength=1.0, convergence_px=0.0)
+    bars = measure_bars(pair)
+    # A bar of one eye, a floating window, brings the border forward by its width.
+    windows_px = max(bars[0][0] - bars[1][0], 0), max(bars[1][1] - bars[0][1], 0)
+    left_px, right_px = (
+        0.0 if px <= window_px + _TOLERATED_CUT_PX else px
+        for px, window_px in zip((left_px, right_px), windows_px, strict=True)
+    )
     return scale * left_px, scale * right_px

@@ -1,5 +1,7 @@
 """Floating windows are as wide as the parallax of what a border cuts off; values worked out by hand."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from view_examples import BOX_PX, WALL_PX
@@ -57,6 +59,14 @@ def test_a_convergence_moves_the_content_to_the_border():
 def test_a_fiftieth_of_the_rows_is_enough(rows, bar_px):
     estimate = estimate_with_box(slice(0, 30), rows=slice(0, rows))
     assert find_windows_px(estimate, strength=1.0, convergence_px=0.0)[0] == max(bar_px, WALL_PX)
+
+
+def test_the_bar_is_no_wider_than_the_nearest_confident_surface():
+    estimate = estimate_with_box(slice(170, 200))
+    unsure = replace(
+        estimate, confidence=np.where(estimate.disparity_px == BOX_PX, 0.2, 1).astype(np.float32)
+    )
+    assert find_windows_px(unsure, strength=1.0, convergence_px=0.0) == (WALL_PX, WALL_PX)
 
 
 def test_a_wrong_estimate_blackens_at_most_6_percent():

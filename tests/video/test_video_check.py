@@ -8,14 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from film_examples import SHIP, WIDTH, box_at_the_left_border, faulty_film, shot_of
+from faulty_video_examples import SHIP, WIDTH, box_at_the_left_border, faulty_film, shot_of
 from PIL import Image
 from rich.progress import Progress
 from video_examples import TEXTURED, example_pairs, flat_pairs, truncate, write_side_by_side, write_video
 
 from stereoweave.cli.root import main
 from stereoweave.matching.matcher import Matcher
-from stereoweave.video.frame_check import check_frame
+from stereoweave.stereo import StereoPair
+from stereoweave.video.frame_check import check_frame, measure_bars
 from stereoweave.video.reader import StereoFrame, open_video
 from stereoweave.video.video_check import check_video
 
@@ -93,6 +94,22 @@ def test_a_bluer_eye_differs_in_colour(matcher):
     found = check_frame(frame_of(left, weaker), matcher)
     assert found.colour_stops == pytest.approx(-2.2 * math.log2(0.8), abs=0.1)
     assert "colour" in found.defects
+
+
+def test_a_floating_window_of_the_object_s_parallax_mends_what_a_border_cuts_off(matcher):
+    left, right = box_at_the_left_border(1)[0]
+    assert check_frame(frame_of(left, right), matcher).windows_px[0] == pytest.approx(12, abs=1.5)
+    for bar_px, expected_px in ((12, 0), (5, 12)):
+        windowed = left.copy()
+        windowed[:, :bar_px] = 0
+        found_px, _ = check_frame(frame_of(windowed, right), matcher).windows_px
+        assert found_px == pytest.approx(expected_px, abs=1.5)
+
+
+def test_bars_of_both_eyes_are_no_floating_window(matcher):
+    left, right = box_at_the_left_border(1)[0]
+    wide = [np.pad(eye, ((0, 0), (30, 30), (0, 0))) for eye in (left, right)]
+    assert measure_bars(StereoPair(left=wide[0], right=wide[1])) == ((30, 30), (30, 30))
 
 
 def test_long_shots_have_a_sample_a_second(tmp_path, matcher):

@@ -26,7 +26,7 @@ def is_video(error: FormatError) -> bool:
     return error.remedy is not None and "video" in error.remedy.settings
 
 
-def check_film(video: "StereoVideo", screen: str | None, timeline: Path | None, as_json: bool) -> None:
+def print_video_check(video: "StereoVideo", screen: str | None, timeline: Path | None, as_json: bool) -> None:
     """Check a stereo video and print what its shots show; the exit status is 1 if there is a defect."""
     from rich.console import Console
 
@@ -68,7 +68,7 @@ def _advise(found: "VideoCheck", timeline: Path | None) -> list[str]:
     return [*lines, *([] if timeline is None else [f"{timeline}: the timeline"])]
 
 
-def refuse_film_options(screen: str | None, timeline: Path | None) -> None:
+def refuse_video_options(screen: str | None, timeline: Path | None) -> None:
     """Raise a StereoweaveError for an option of videos that is given with pictures."""
     for option, value in (("--screen", screen), ("--timeline", timeline)):
         if value is not None:

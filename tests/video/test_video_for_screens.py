@@ -1,0 +1,196 @@
+"""`stereoweave video --screen`: whole conversions, resuming, layouts, odd films, and mistakes."""
+
+import re
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from faulty_video_examples import box_at_the_left_border, shot_of
+from video_examples import TEXTURED, example_pairs, flat_pairs, truncate, write_side_by_side
+
+from stereoweave.cli.root import main
+from stereoweave.matching.estimate import match
+from stereoweave.matching.matcher import Matcher
+from stereoweave.rendering.comfort import measure_depth
+from stereoweave.stereo import StereoPair
+from stereoweave.video.reader import StereoFrame, StereoVideo, open_video
+
+# A part lasts 4 s, so it has 5 of these frames.
+SLOW_MS = 800
+
+
+@pytest.fixture(autouse=True)
+def default_interrupts():
+    """Restore the handler for Ctrl-C, which Python ignores if a shell starts the tests in the background."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def run(video: Path, out: Path, *words: str) -> int:
+    return main(["video", str(video), "-o", str(out), "--threads", "1", *words])
+
+
+def slow_video(path: Path) -> Path:
+    """Write a video with a cut in its second part."""
+    pairs = example_pairs(7) + [(left[::-1], right[::-1]) for left, right in example_pairs(10)[7:]]
+    return write_side_by_side(path, pairs, times_ms=range(0, 10 * SLOW_MS, SLOW_MS), codec="libx264")
+
+
+def frames_of(video: Path) -> list[np.ndarray]:
+    with av.open(str(video)) as container:
+        return [frame.to_ndarray() for frame in container.decode(video=0)]
+
+
+def interrupt(patch: pytest.MonkeyPatch) -> None:
+    """Let the reader raise the signal of Ctrl-C at frame 8, once a part is finished."""
+    read = StereoVideo.frames
+
+    def frames(video: StereoVideo, start: int = 0) -> Iterator[StereoFrame]:
+        for index, frame in enumerate(read(video, start), start):
+            if index == 8 and any(Path(video.name).parent.glob("*.parts/*.nut")):
+                signal.raise_signal(signal.SIGINT)
+            yield frame
+
+    patch.setattr(StereoVideo, "frames", frames)
+
+
+def eyes_of(video: Path) -> list:
+    return list(open_video([video], "side_by_side").frames())
+
+
+def test_the_depth_of_the_output_is_within_the_budget(tmp_path, capsys):
+    video = write_side_by_side(tmp_path / "in.mp4", shot_of(TEXTURED, 3), codec="libx264")
+    assert run(video, tmp_path / "out.mp4", "--layout", "side_by_side", "--screen", "television") == 0
+    line = capsys.readouterr().out.splitlines()[1]
+    assert line.startswith("television: strength ")
+    assert line.endswith("px, depth -1.0 % to +2.0 % of the width")
+    for frame in eyes_of(tmp_path / "out_LRF_Full_SBS.mp4"):
+        # 1 % and 2 % of 320 px, measured anew in the compressed pictures.
+        pair = StereoPair(left=frame.left, right=frame.right)
+        found = measure_depth(match(Matcher("small", threads=1), pair))
+        assert found.near_px == pytest.approx(3.2, abs=0.8)
+        assert found.far_px == pytest.approx(-6.4, abs=0.8)
+
+
+def test_a_box_at_the_border_gets_a_floating_window(tmp_path):
+    video = write_side_by_side(tmp_path / "in.mp4", box_at_the_left_border(2), codec="libx264")
+    # The wall stays on the screen, and the box is 12 px in front, less than 4 % of 320 px.
+    words = ("--layout", "side_by_side", "--screen", "light_field", "--convergence", "0")
+    assert run(video, tmp_path / "out.mp4", *words) == 0
+    for frame in eyes_of(tmp_path / "out_LRF_Full_SBS.mp4"):
+        black = frame.left.max((0, 2)) < 40
+        assert black[:10].all()
+        assert not black[15:].any()
+        assert not (frame.right.max((0, 2)) < 40).any()
+
+
+@pytest.mark.parametrize("layout", ["side_by_side", "top_bottom_half"])
+def test_an_interrupted_conversion_for_a_screen_resumes_with_the_same_frames(
+    tmp_path, monkeypatch, capsys, layout
+):
+    words = ("--layout", layout, "--screen", "phone")
+    video = slow_video(tmp_path / "in.mp4")
+    assert run(video, tmp_path / "whole.mp4", *words) == 0
+    with monkeypatch.context() as patch:
+        interrupt(patch)
+        assert run(video, tmp_path / "broken.mp4", *words) == 130
+    before = capsys.readouterr().out.splitlines()
+    assert run(video, tmp_path / "broken.mp4", *words) == 0
+    [whole], [broken] = tmp_path.glob("whole*"), tmp_path.glob("broken*")
+    np.testing.assert_array_equal(frames_of(broken), frames_of(whole))
+    # The line at the end counts the frames before the interruption, too.
+    assert capsys.readouterr().out.splitlines()[1] == before[1]
+
+
+def test_parts_for_another_screen_are_not_resumed(tmp_path, monkeypatch, capsys):
+    video = slow_video(tmp_path / "in.mp4")
+    with monkeypatch.context() as patch:
+        interrupt(patch)
+        assert run(video, tmp_path / "out.mp4", "--layout", "side_by_side", "--screen", "phone") == 130
+    capsys.readouterr()
+    assert run(video, tmp_path / "out.mp4", "--layout", "side_by_side", "--screen", "headset") == 2
+    assert "found parts made with another --screen" in capsys.readouterr().err
+
+
+def test_half_width_gives_the_values_of_the_full_width(tmp_path, capsys):
+    video = write_side_by_side(tmp_path / "in.mp4", shot_of(TEXTURED, 2), codec="libx264")
+    values = []
+    for layout in ("side_by_side", "side_by_side_half"):
+        assert run(video, tmp_path / "out.mp4", "--layout", layout, "--screen", "television") == 0
+        line = capsys.readouterr().out.splitlines()[1]
+        values.append([float(number) for number in re.findall(r"-?\d+\.\d+", line)])
+    strength, convergence_px = values[0][0], values[0][1]
+    assert values[1][0] == pytest.approx(strength, abs=0.06)
+    assert values[1][1] == pytest.approx(convergence_px, abs=1.5)
+
+
+@pytest.mark.parametrize("layout", ["quilt", "contact_sheet"])
+def test_layouts_of_many_views_are_fitted_without_windows(tmp_path, capsys, layout):
+    video = write_side_by_side(tmp_path / "in.mp4", example_pairs(1), codec="libx264")
+    assert run(video, tmp_path / "out.mp4", "--layout", layout, "--screen", "light_field") == 0
+    assert capsys.readouterr().out.splitlines()[1].startswith("light_field: strength")
+
+
+def one_eye_black(pairs: list, side: int) -> list:
+    return [
+        tuple(np.zeros_like(eye) if index == side else eye for index, eye in enumerate(pair))
+        for pair in pairs
+    ]
+
+
+ODD = {
+    "one frame": lambda: example_pairs(1),
+    "two frames": lambda: example_pairs(2),
+    "left eye black": lambda: one_eye_black(example_pairs(3), 0),
+    "right eye black": lambda: one_eye_black(example_pairs(3), 1),
+    "black": lambda: [(np.zeros((96, 160, 3), np.uint8),) * 2] * 3,
+    "one colour": lambda: flat_pairs(3),
+    "the same view twice": lambda: [(left, left) for left, _ in example_pairs(3)],
+    "swapped": lambda: [pair[::-1] for pair in example_pairs(3)],
+    "a cut at each frame": lambda: [example_pairs(1)[0], flat_pairs(1, width=160, height=96)[0]] * 3,
+}
+
+
+@pytest.mark.parametrize("name", ODD)
+def test_an_odd_film_is_converted_or_refused_in_one_line(name, tmp_path, capsys):
+    video = write_side_by_side(tmp_path / "in.mp4", ODD[name](), codec="libx264")
+    words = ("--layout", "side_by_side", "--screen", "phone", "--format", "side_by_side")
+    assert run(video, tmp_path / "out.mp4", *words) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1].startswith("phone: ")
+    assert "nan" not in lines[1]
+    assert "inf" not in lines[1]
+
+
+def test_a_cut_file_is_converted_as_far_as_it_goes(tmp_path, capsys):
+    whole = write_side_by_side(tmp_path / "in.mkv", example_pairs(20), codec="libx264", options={"g": "4"})
+    video = truncate(whole, 0.6)
+    assert run(video, tmp_path / "out.mp4", "--layout", "side_by_side", "--screen", "phone") == 0
+    assert "phone: strength" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (
+            "--depth --screen phone",
+            "--screen: expected only with a layout of several views, found",
+        ),
+        ("--position 0.5 --screen phone", "found with position"),
+        ("--layout rgbd --screen phone", "found with rgbd"),
+        (
+            "--layout side_by_side --screen cinema",
+            "--screen: expected one of phone, television",
+        ),
+        ("--layout quilt --screen phone --strength 9", "position: expected -1 to 2"),
+        ("--layout side_by_side --screen phone --convergence nan", "--convergence: expected a finite number"),
+    ],
+)
+def test_a_mistake_is_one_line(words, expected, tmp_path, capsys):
+    assert run(tmp_path / "missing.mp4", tmp_path / "out.mp4", *words.split()) == 2
+    [line] = capsys.readouterr().err.splitlines()
+    assert expected in line
