@@ -83,7 +83,16 @@ def test_every_module_outside_learn_can_be_imported_without_pytorch_and_gradio()
     modules = modules_without_pytorch()
     assert "stereoweave.matching.matcher" in modules
     # Imported only by the command `app`.
-    for name in ("events", "page", "pair_form", "pair_tab", "server", "stereo_picture_tab", "video_tab"):
+    for name in (
+        "events",
+        "frame_panel",
+        "page",
+        "pair_form",
+        "pair_tab",
+        "server",
+        "stereo_picture_tab",
+        "video_tab",
+    ):
         modules.remove(f"stereoweave.app.{name}")
     program = (
         f"import sys, {', '.join(modules)}; "
