@@ -19,12 +19,13 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from stereoweave.errors import StereoweaveError
+from stereoweave.matching.refine import right_confidence
 from stereoweave.stereo import Estimate
 from stereoweave.system.threads import thread_count
 from stereoweave.video.camera_motion import find_corners
 from stereoweave.video.moved_points import MovedPoints, find_camera_motion, move_points
 from stereoweave.video.motion import CUT_SHARE, Motion, convert_to_grey, halve, measure_motion
-from stereoweave.video.temporal_kernels import SAME_PX, SAME_SHARE, Track, blend, carry, measure_drift
+from stereoweave.video.temporal_kernels import LEAST_WEIGHT, SAME_PX, SAME_SHARE, Track, blend, carry, measure_drift
 
 # If at least this share of the image is at rest, a majority of contradictions cannot be due to chance.
 _LEAST_ASKED_SHARE = 0.25
@@ -92,12 +93,10 @@ class TemporalFilter:
                 f"{list(right.shape[:2])}; pass the estimate of this pair"
             )
         before, self._greys = self._greys, [convert_to_grey(left), convert_to_grey(right)]
-        # The right view has no confidence; the placeholder is not returned.
-        confidences = (estimate.confidence, np.ones_like(estimate.confidence))
+        confidences = (estimate.confidence, right_confidence(estimate))
         disparities_px = (estimate.disparity_px, estimate.right_disparity_px)
         new_tracks = [
-            Track(*maps, np.ones_like(maps[0]), np.zeros((*maps[0].shape, 2), np.float32))
-            for maps in zip(disparities_px, confidences, strict=True)
+            _begin_track(*maps) for maps in zip(disparities_px, confidences, strict=True)
         ]
         continued = self._filter_tracks(before, new_tracks) if before else None
         if before and continued is None:
@@ -157,6 +156,15 @@ class TemporalFilter:
             if _is_contradicted(new_tracks, expected):
                 return None
             return list(pool.map(_update, new_tracks, expected))
+
+
+def _begin_track(disparity_px: Float[np.ndarray, "h w"], confidence: Float[np.ndarray, "h w"]) -> Track:
+    """Return the track of a view of the first frame."""
+    weights = np.maximum(confidence, LEAST_WEIGHT).astype(np.float32)
+    nothing = np.zeros_like(weights)
+    return Track(
+        disparity_px, confidence.astype(np.float32), weights, np.zeros((*weights.shape, 2), np.float32), nothing, nothing
+    )
 
 
 def _predict(
