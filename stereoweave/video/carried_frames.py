@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, UInt8
 
+from stereoweave.matching.edge_vote.vote import sharpen_edges
 from stereoweave.matching.left_right_check import find_occluded
 from stereoweave.stereo import Estimate, StereoPair
 from stereoweave.video.camera_motion import TrackedCorners, find_corners
@@ -50,7 +51,7 @@ def carry_depth(
     """
     for (frames, pairs), estimate in matched:
         before, last = temporal_filter.last, pairs[-1]
-        steady = temporal_filter(last.left, last.right, estimate)
+        steady = temporal_filter(last.left, last.right, sharpen_edges(last.left, estimate, threads))
         carried = carry_between(pairs[:-1], before, temporal_filter.last, threads)
         yield from map(EstimatedFrame, frames, pairs, [*carried, steady])
 

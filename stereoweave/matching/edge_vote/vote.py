@@ -48,8 +48,23 @@ def vote_at_edges(
         estimate: The pair's estimate.
         threads: Maximum number of threads; default: all cores.
     """
-    disparity_px, confidence = _vote(image, estimate, threads)
+    unsound = _find_unsound(
+        np.asarray(estimate.disparity_px, np.float32), np.asarray(estimate.confidence, np.float32)
+    )
+    disparity_px, confidence = _vote(image, estimate, unsound, threads)
     return replace(estimate, disparity_px=disparity_px, confidence=confidence)
+
+
+def sharpen_edges(
+    image: UInt8[np.ndarray, "h w 3"], estimate: Estimate, threads: int | None = None
+) -> Estimate:
+    """Replace the left disparities at edges alone by their neighbours' vote; the confidence does not change.
+
+    This takes half the time of `vote_at_edges` and spares thin things, which may be speckles.
+    """
+    at_edges = _find_steps(np.asarray(estimate.disparity_px, np.float32))
+    disparity_px, _ = _vote(image, estimate, at_edges, threads)
+    return replace(estimate, disparity_px=disparity_px)
 
 
 def rehearse_voting() -> None:
@@ -60,16 +75,18 @@ def rehearse_voting() -> None:
 
 
 def _vote(
-    image: UInt8[np.ndarray, "h w 3"], estimate: Estimate, threads: int | None
+    image: UInt8[np.ndarray, "h w 3"],
+    estimate: Estimate,
+    unsound: Bool[np.ndarray, "h w"],
+    threads: int | None,
 ) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
-    """Return the disparities and confidences after all rounds."""
+    """Return the disparities and confidences after all rounds; `unsound` becomes the pixels without a vote."""
     from stereoweave.matching.edge_vote.vote_kernels import vote  # it loads LLVM
 
     lab = cv2.cvtColor(image.astype(np.float32) / 255, cv2.COLOR_RGB2LAB)
     disparity_px = np.array(estimate.disparity_px, np.float32)
     claimed = np.array(estimate.confidence, np.float32)
     confidence = claimed.copy()
-    unsound = _find_unsound(disparity_px, claimed)
     kept = ~unsound
     bands = thread_count(threads)
     for _ in range(_ROUNDS):
@@ -91,13 +108,17 @@ def _find_unsound(
     disparity_px: Float32[np.ndarray, "h w"], confidence: Float32[np.ndarray, "h w"]
 ) -> Bool[np.ndarray, "h w"]:
     """Return the mask of the pixels at edges, in speckles and of low confidence."""
-    around = np.ones((3, 3), np.uint8)
-    steps = cv2.dilate(disparity_px, around) - cv2.erode(disparity_px, around) > _STEP_PX
     parts = np.rint(_PARTS_OF_PX * (disparity_px - disparity_px.min() + 1))
     whole = np.minimum(parts, np.iinfo(np.int16).max).astype(np.int16)
     speckles = _find_speckles(whole, _SPECKLE_PIXELS)
     speckles |= (confidence < _DOUBTED) & _find_speckles(whole, _LARGE_SPECKLE_PIXELS)
-    return steps | speckles | (confidence < _UNSURE)
+    return _find_steps(disparity_px) | speckles | (confidence < _UNSURE)
+
+
+def _find_steps(disparity_px: Float32[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Return the mask of the pixels at edges."""
+    around = np.ones((3, 3), np.uint8)
+    return cv2.dilate(disparity_px, around) - cv2.erode(disparity_px, around) > _STEP_PX
 
 
 def _find_speckles(parts: Int16[np.ndarray, "h w"], pixels: int) -> Bool[np.ndarray, "h w"]:
