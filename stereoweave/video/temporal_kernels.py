@@ -149,7 +149,7 @@ def blend(new, carried, calm, drift_px, mean):
             rival_count = old_rival_frames[y, x]
             offset_px[y, x, 0], offset_px[y, x, 1] = old_offset_px[y, x, 0], old_offset_px[y, x, 1]
             if count > 0 and abs(apart_px) > same_px:
-                if calm[y // 2, x // 2]:
+                if calm[y // 2, x // 2] or weight < 0.5 * old_confidence[y, x]:
                     if rival_count > 0 and abs(new_px[y, x] - rival) <= same_px:
                         rival_count += weight
                         rival += weight / rival_count * (new_px[y, x] - rival)
