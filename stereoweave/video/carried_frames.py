@@ -16,11 +16,11 @@ from jaxtyping import Float32, Float64, Int32, UInt8
 from stereoweave.matching.edge_vote.vote import sharpen_edges
 from stereoweave.matching.left_right_check import find_occluded
 from stereoweave.stereo import Estimate, StereoPair
-from stereoweave.video.camera_motion import TrackedCorners, find_corners
+from stereoweave.video.camera_motion import TrackedCorners, find_camera_motion, find_corners
 from stereoweave.video.carried_kernels import Source, locate, take_pixels
 from stereoweave.video.frame_groups import FrameGroup
 from stereoweave.video.motion import convert_to_grey, halve, measure_motion
-from stereoweave.video.moved_points import find_camera_motion, move_points
+from stereoweave.video.moved_points import move_points
 from stereoweave.video.reader import StereoFrame
 from stereoweave.video.temporal_filter import FilteredFrame, TemporalFilter
 from stereoweave.video.temporal_kernels import Track
@@ -51,7 +51,10 @@ def carry_depth(
     """
     for (frames, pairs), estimate in matched:
         before, last = temporal_filter.last, pairs[-1]
-        steady = temporal_filter(last.left, last.right, sharpen_edges(last.left, estimate, threads))
+        filtered = temporal_filter(last.left, last.right, sharpen_edges(last.left, estimate, threads))
+        # Pixels are filtered one by one, which frays edges.
+        steady = sharpen_edges(last.left, filtered, threads)
+        temporal_filter.replace_left(steady.disparity_px)
         carried = carry_between(pairs[:-1], before, temporal_filter.last, threads)
         yield from map(EstimatedFrame, frames, pairs, [*carried, steady])
 
@@ -70,7 +73,9 @@ def carry_between(
     if not pairs or before is None or after is None:
         return []
     shares = [number / (len(pairs) + 1) for number in range(1, len(pairs) + 1)]
-    matched = [(frame, find_corners(halve(frame.left_grey), frame.left.disparity_px)) for frame in (before, after)]
+    matched = [
+        (frame, find_corners(halve(frame.left_grey), frame.left.disparity_px)) for frame in (before, after)
+    ]
     with ThreadPoolExecutor(min(threads, len(pairs))) as pool:
         return list(pool.map(_carry, pairs, repeat(matched), shares))
 
@@ -122,7 +127,9 @@ def _carry_view(
     """
     own, other = greys
     before, after = (
-        Source(grey, track.disparity_px, track.confidence, _find_places(own, grey, track, camera, towards > 0))
+        Source(
+            grey, track.disparity_px, track.confidence, _find_places(own, grey, track, camera, towards > 0)
+        )
         for (grey, track), camera in zip(matched, cameras, strict=True)
     )
     disparity_px, confidence = np.empty(own.shape, np.float32), np.empty(own.shape, np.float32)

@@ -2,8 +2,6 @@
 
 import typing
 
-import numpy as np
-
 from stereoweave.system.jit import kernel
 
 _IN_FRONT_PX = 1.0
@@ -63,7 +61,10 @@ def splat(matrix, right, disparity_px, offset_px, nearest_px, source, new_offset
             if not abs(before_px - after_px) <= 2 * _IN_FRONT_PX or before_px < -1e8:
                 before_px, after_px = nearest_px[y - 1, x], nearest_px[y + 1, x]
                 step = width
-            if abs(before_px - after_px) <= 2 * _IN_FRONT_PX and before_px > nearest_px[y, x] + 2 * _IN_FRONT_PX:
+            if (
+                abs(before_px - after_px) <= 2 * _IN_FRONT_PX
+                and before_px > nearest_px[y, x] + 2 * _IN_FRONT_PX
+            ):
                 index = source[y, x - 1] if step == 1 else source[y - 1, x]
                 if index >= 0:
                     source[y, x] = index

@@ -16,16 +16,24 @@ from functools import partial
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Float32, UInt8
 
 from stereoweave.errors import StereoweaveError
 from stereoweave.matching.refine import right_confidence
 from stereoweave.stereo import Estimate
 from stereoweave.system.threads import thread_count
-from stereoweave.video.camera_motion import find_corners
-from stereoweave.video.moved_points import MovedPoints, find_camera_motion, move_points
+from stereoweave.video.camera_motion import find_camera_motion, find_corners
 from stereoweave.video.motion import CUT_SHARE, Motion, convert_to_grey, halve, measure_motion
-from stereoweave.video.temporal_kernels import LEAST_WEIGHT, SAME_PX, SAME_SHARE, Track, blend, carry, measure_drift
+from stereoweave.video.moved_points import MovedPoints, move_points
+from stereoweave.video.temporal_kernels import (
+    LEAST_WEIGHT,
+    SAME_PX,
+    SAME_SHARE,
+    Track,
+    blend,
+    carry,
+    measure_drift,
+)
 
 # If at least this share of the image is at rest, a majority of contradictions cannot be due to chance.
 _LEAST_ASKED_SHARE = 0.25
@@ -95,9 +103,7 @@ class TemporalFilter:
         before, self._greys = self._greys, [convert_to_grey(left), convert_to_grey(right)]
         confidences = (estimate.confidence, right_confidence(estimate))
         disparities_px = (estimate.disparity_px, estimate.right_disparity_px)
-        new_tracks = [
-            _begin_track(*maps) for maps in zip(disparities_px, confidences, strict=True)
-        ]
+        new_tracks = [_begin_track(*maps) for maps in zip(disparities_px, confidences, strict=True)]
         continued = self._filter_tracks(before, new_tracks) if before else None
         if before and continued is None:
             self.cuts += 1
@@ -117,6 +123,10 @@ class TemporalFilter:
             return None
         (left_grey, right_grey), (left, right) = self._greys, self._tracks
         return FilteredFrame(left_grey, right_grey, left, right)
+
+    def replace_left(self, disparity_px: Float32[np.ndarray, "h w"]) -> None:
+        """Replace the left disparity of the last frame, with which the next one is filtered."""
+        self._tracks[0] = self._tracks[0]._replace(disparity_px=disparity_px)
 
     def state(self) -> dict[str, np.ndarray]:
         """Return the complete state as arrays for `np.savez`; a restored filter gives the same results."""
@@ -142,9 +152,7 @@ class TemporalFilter:
             return None
         with ThreadPoolExecutor(self._threads) as pool:
             halves, old_halves = [*map(halve, self._greys)], [*map(halve, before)]
-            camera = find_camera_motion(
-                find_corners(old_halves[0], self._tracks[0].disparity_px), halves[0]
-            )
+            camera = find_camera_motion(find_corners(old_halves[0], self._tracks[0].disparity_px), halves[0])
             moved = list(pool.map(partial(move_points, camera), self._tracks, (False, True)))
             paths = [points.path for points in moved]
             motions = list(pool.map(measure_motion, old_halves, halves, paths))
@@ -163,7 +171,12 @@ def _begin_track(disparity_px: Float[np.ndarray, "h w"], confidence: Float[np.nd
     weights = np.maximum(confidence, LEAST_WEIGHT).astype(np.float32)
     nothing = np.zeros_like(weights)
     return Track(
-        disparity_px, confidence.astype(np.float32), weights, np.zeros((*weights.shape, 2), np.float32), nothing, nothing
+        disparity_px,
+        confidence.astype(np.float32),
+        weights,
+        np.zeros((*weights.shape, 2), np.float32),
+        nothing,
+        nothing,
     )
 
 

@@ -160,7 +160,9 @@ def blend(new, carried, calm, drift_px, mean):
                     lost = rival_count > max(count, LEAST_RIVAL)
                     disparity_px[y, x] = rival if lost else expected_px
                     frames[y, x] = rival_count if lost else count
-                    confidence[y, x] = new_confidence[y, x] if lost else old_confidence[y, x] * count / (count + weight)
+                    confidence[y, x] = (
+                        new_confidence[y, x] if lost else old_confidence[y, x] * count / (count + weight)
+                    )
                     rival_px[y, x] = expected_px if lost else rival
                     rival_frames[y, x] = count if lost else rival_count
                     if lost:
@@ -169,7 +171,7 @@ def blend(new, carried, calm, drift_px, mean):
                 count = 0.0
             if count == 0.0:
                 offset_px[y, x, 0] = offset_px[y, x, 1] = 0.0
-            rival_px[y, x], rival_frames[y, x] = rival, max(rival_count - 0.5*weight, 0.0)
+            rival_px[y, x], rival_frames[y, x] = rival, max(rival_count - 0.5 * weight, 0.0)
             if count == 0.0:
                 rival_frames[y, x] = 0.0
             count = min(count + weight, MOST_FRAMES)

@@ -23,7 +23,9 @@ _SPECKLE_PIXELS, _SPECKLE_STEP_PX = 100, 1
 _LARGE_SPECKLE_PIXELS, _DOUBTED = 400, 0.5
 # Disparities less confident than this are replaced.
 _UNSURE = 0.2
-_THIN_PX = 7
+# Things into which no square of this size fits are thin, if the image shows lines there: of at least this
+# difference in grey levels from what is around them, several times the noise of a video.
+_THIN_PX, _LINE_LEVELS = 7, 24
 # Number of rounds; each one reaches 4 px farther into areas without sound disparities, as on plain surfaces.
 _ROUNDS = 16
 # Confidence of a replaced disparity if both cameras see the pixel, and if one does, plus these shares of its
@@ -59,14 +61,20 @@ def vote_at_edges(
 def sharpen_edges(
     image: UInt8[np.ndarray, "h w 3"], estimate: Estimate, threads: int | None = None
 ) -> Estimate:
-    """Replace the left disparities at edges alone by their neighbours' vote; the confidence does not change.
+    """Replace the left disparities at edges by their neighbours' vote, but for thin things.
 
-    This takes half the time of `vote_at_edges` and spares thin things, which may be speckles.
+    Confidences do not change. This takes half the time of `vote_at_edges`, which removes thin things as
+    speckles.
+
+    Args:
+        image: Left image, uint8 RGB [H, W, 3].
+        estimate: The pair's estimate.
+        threads: Maximum number of threads; default: all cores.
     """
     disparity_px = np.asarray(estimate.disparity_px, np.float32)
-    at_edges = _find_steps(disparity_px) & ~_find_thin(disparity_px, estimate.confidence)
-    disparity_px, _ = _vote(image, estimate, at_edges, threads)
-    return replace(estimate, disparity_px=disparity_px)
+    unsound = _find_steps(disparity_px) & ~_find_thin(image, disparity_px, estimate.confidence)
+    sharp_px, _ = _vote(image, estimate, unsound, threads)
+    return replace(estimate, disparity_px=sharp_px)
 
 
 def rehearse_voting() -> None:
@@ -124,12 +132,16 @@ def _find_steps(disparity_px: Float32[np.ndarray, "h w"]) -> Bool[np.ndarray, "h
 
 
 def _find_thin(
-    disparity_px: Float32[np.ndarray, "h w"], confidence: Float32[np.ndarray, "h w"]
+    image: UInt8[np.ndarray, "h w 3"],
+    disparity_px: Float32[np.ndarray, "h w"],
+    confidence: Float32[np.ndarray, "h w"],
 ) -> Bool[np.ndarray, "h w"]:
-    """Return the mask of the confident pixels of things into which no square of 7x7 pixels fits."""
+    """Return the mask of the pixels of thin things that are not quite unsure and that the image shows too."""
     around = np.ones((_THIN_PX, _THIN_PX), np.uint8)
-    thick_px = cv2.morphologyEx(disparity_px, cv2.MORPH_OPEN, around)
-    return (disparity_px - thick_px > _STEP_PX) & (confidence > 0.25)
+    before_px = disparity_px - cv2.morphologyEx(disparity_px, cv2.MORPH_OPEN, around)
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    lines = [cv2.morphologyEx(grey, kind, around) for kind in (cv2.MORPH_TOPHAT, cv2.MORPH_BLACKHAT)]
+    return (before_px > _STEP_PX) & (np.maximum(*lines) > _LINE_LEVELS) & (confidence > _UNSURE)
 
 
 def _find_speckles(parts: Int16[np.ndarray, "h w"], pixels: int) -> Bool[np.ndarray, "h w"]:
