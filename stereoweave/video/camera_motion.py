@@ -11,30 +11,34 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, Float64, UInt8
+from jaxtyping import Float, Float64, UInt8
 
-# One corner is tracked in each cell of this size, at half size, if its contrast exceeds the noise.
+from stereoweave.video.motion import match_brightness
+
+# The strongest corner of each cell of this size is tracked, at half size, if it is stronger than noise.
 _CELL_PX, _LEAST_CORNER = 12, 5e-5
-_WINDOW_PX, _LEVELS = 13, 4
+_CORNER_PX, _WINDOW_PX, _LEVELS = 5, 13, 4
+_STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 12, 0.02)
 _ROUNDS = 8
 # Corners that are farther off than this multiple of the median do not count; the median is at least the
-# second number. A corner follows the camera if it is off by less than the third.
+# second number of px. A corner follows the camera if it is off by less than the third.
 _TUKEY, _LEAST_SPREAD_PX, _FOLLOWS_PX = 4.0, 0.1, 1.0
-_LEAST_CORNERS = 60
-# Places are in units of the width, disparities in units of 1/10 of it, so that one ridge suits all.
+_LEAST_CORNERS, _LEAST_SHARE = 60, 0.5
+# Places are in units of the width, disparities in units of a tenth of it, so that one ridge suits all.
 _DISPARITY_UNIT = 0.1
 # Keeps the fit defined where all disparities are equal, as of a picture on a wall.
 _RIDGE = 1e-6
-_LEAST_SHARE = 0.5
+# A camera that moves its picture by less than this rests.
+_LEAST_MOTION_PX = 0.1
 
 
 class TrackedCorners(NamedTuple):
-    """Corners of a frame and their disparities.
+    """Corners of a frame.
 
     Attributes:
         grey: uint8 [H2, W2], left image at half size.
         places_px: float32 [N, 2], columns and rows at half size.
-        points: float64 [N, 4], their (x, y, 1, d) in units of the fit.
+        points: float64 [N, 4], (x, y, 1, d) of each corner, in full-size pixels.
         width_px: Width of the frame at full size.
     """
 
@@ -46,21 +50,20 @@ class TrackedCorners(NamedTuple):
 
 def find_corners(grey: UInt8[np.ndarray, "h2 w2"], disparity_px: Float[np.ndarray, "h w"]) -> TrackedCorners:
     """Return the strongest corner of each cell of a left image at half size, with its disparity."""
-    strength = cv2.cornerMinEigenVal(grey, 5)
+    strength = cv2.cornerMinEigenVal(grey, _CORNER_PX)
     height, width = (side // _CELL_PX for side in strength.shape)
     cells = strength[: height * _CELL_PX, : width * _CELL_PX].reshape(height, _CELL_PX, width, _CELL_PX)
     cells = cells.transpose(0, 2, 1, 3).reshape(height, width, _CELL_PX**2)
-    rows, columns = np.indices((height, width)) * _CELL_PX + np.array(np.divmod(cells.argmax(2), _CELL_PX))
-    strong = cells.max(2) > _LEAST_CORNER
-    rows, columns = rows[strong], columns[strong]
+    within = np.array(np.divmod(cells.argmax(2), _CELL_PX))
+    rows, columns = (_CELL_PX * np.indices((height, width)) + within)[:, cells.max(2) > _LEAST_CORNER]
     d_px = disparity_px[2 * rows, 2 * columns].astype(np.float64)
-    points = _normalise(2.0 * columns + 0.5, 2.0 * rows + 0.5, d_px, disparity_px.shape[1])
-    return TrackedCorners(
-        grey, np.stack([columns, rows], 1).astype(np.float32), points, disparity_px.shape[1]
-    )
+    # A pixel at half size covers two pixels in each direction.
+    points = np.stack([2.0 * columns + 0.5, 2.0 * rows + 0.5, np.ones_like(d_px), d_px], 1)
+    places_px = np.stack([columns, rows], 1).astype(np.float32)
+    return TrackedCorners(grey, places_px, points, disparity_px.shape[1])
 
 
-def fit_camera_motion(
+def find_camera_motion(
     corners: TrackedCorners, grey: UInt8[np.ndarray, "h2 w2"]
 ) -> Float64[np.ndarray, "4 4"] | None:
     """Return the matrix that moves the points (x, y, 1, d) of a frame to another frame, in full-size pixels.
@@ -70,73 +73,59 @@ def fit_camera_motion(
         grey: Left image of the other frame, at half size.
 
     Returns:
-        The matrix, or None if most of the corners are not found again or move otherwise.
+        The matrix, or None if the camera rests, or if most of the corners are lost or move otherwise.
     """
-    if len(corners.places_px) < _LEAST_CORNERS:
+    if len(corners.points) < _LEAST_CORNERS:
         return None
+    before = match_brightness(corners.grey, grey)
     there, found, _ = cv2.calcOpticalFlowPyrLK(
-        corners.grey,
-        grey,
-        corners.places_px,
-        None,
-        winSize=(_WINDOW_PX, _WINDOW_PX),
-        maxLevel=_LEVELS,
-        criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 12, 0.02),
+        before, grey, corners.places_px, None, winSize=(_WINDOW_PX,) * 2, maxLevel=_LEVELS, criteria=_STOP
     )
     kept = found[:, 0] > 0
     if kept.sum() < _LEAST_CORNERS:
         return None
-    columns, rows = 2.0 * there[kept].T.astype(np.float64) + 0.5
-    matrix, share = _fit_robustly(corners.points[kept], np.stack([columns, rows], 1) / corners.width_px)
-    # Corners that were lost do not follow the camera.
-    if share * kept.mean() < _LEAST_SHARE:
+    points, there_px = corners.points[kept], 2.0 * there[kept].astype(np.float64) + 0.5
+    if np.percentile(np.hypot(*(there_px - points[:, :2]).T), 90) < _LEAST_MOTION_PX:
         return None
-    unit = np.diag([corners.width_px, corners.width_px, 1.0, _DISPARITY_UNIT * corners.width_px])
-    return unit @ matrix @ np.linalg.inv(unit)
-
-
-def _normalise(
-    columns: np.ndarray, rows: np.ndarray, disparity_px: np.ndarray, width_px: int
-) -> Float64[np.ndarray, "n 4"]:
-    ones = np.ones_like(disparity_px)
-    return np.stack([columns, rows, ones, disparity_px / _DISPARITY_UNIT], 1) / [
-        width_px,
-        width_px,
-        1,
-        width_px,
-    ]
+    unit = np.diag([1.0, 1.0, 1.0 / corners.width_px, _DISPARITY_UNIT]) * corners.width_px
+    matrix = unit @ _fit_robustly(
+        points @ np.linalg.inv(unit), there_px / corners.width_px, 1 / corners.width_px
+    )
+    matrix = matrix @ np.linalg.inv(unit)
+    apart_px = _measure_distances(matrix, points, there_px)
+    # Corners that were lost do not follow the camera.
+    return matrix if (apart_px < _FOLLOWS_PX).mean() * kept.mean() >= _LEAST_SHARE else None
 
 
 def _fit_robustly(
-    points: Float64[np.ndarray, "n 4"], there: Float64[np.ndarray, "n 2"]
-) -> tuple[Float64[np.ndarray, "4 4"], float]:
-    """Return the matrix that fits most points, by Tukey's weights, and the share of the points it fits.
+    points: Float64[np.ndarray, "n 4"], there: Float64[np.ndarray, "n 2"], px: float
+) -> Float64[np.ndarray, "4 4"]:
+    """Return the matrix that moves most points there, by least squares with Tukey's weights.
 
-    The equations are linear in the matrix: its first two rows, minus the new place times the third row, are 0
-    for each point. The third row begins with that of the unit matrix, and the last row keeps it: a point twice
-    as far away has half the disparity.
+    Each point gives two equations that are linear in the matrix: its new place times the third row is the
+    first row, or the second. The last row is that of the unit matrix, because a point twice as far away has
+    half the disparity. `px` is the length of a pixel.
     """
-    weights, width = np.ones(len(points)), 1.0
-    still = np.eye(4)[:3, :]
-    matrix = np.eye(4)
-    x, y, _, d = points.T
-    nothing = np.zeros_like(points)
-    # Unknown: rows 0 and 1, and three numbers of row 2, as changes from the unit matrix.
-    of_third = np.stack([x, y, d], 1)
-    along = np.concatenate([points, nothing, -there[:, :1] * of_third], 1)
-    down = np.concatenate([nothing, points, -there[:, 1:] * of_third], 1)
-    moved = there - points[:, :2]
-    reach = 1.0
-    share = 0.0
+    nothing, known = np.zeros_like(points), points[:, [0, 1, 3]]
+    across = np.concatenate([points, nothing, -there[:, :1] * known], 1)
+    down = np.concatenate([nothing, points, -there[:, 1:] * known], 1)
+    equations, moved = np.concatenate([across, down]), (there - points[:, :2]).T.ravel()
+    weights, matrix = np.ones(len(points)), np.eye(4)
     for _ in range(_ROUNDS):
-        normal = (along * weights[:, None]).T @ along + (down * weights[:, None]).T @ down
-        right = (along * weights[:, None]).T @ moved[:, 0] + (down * weights[:, None]).T @ moved[:, 1]
-        change = np.linalg.solve(normal + _RIDGE * weights.sum() * np.eye(11), right)
-        matrix[:2] = still[:2] + change[:8].reshape(2, 4)
-        matrix[2] = still[2] + [change[8], change[9], 0, change[10]]
-        placed = points @ matrix.T
-        apart = np.hypot(*(placed[:, :2] / placed[:, 2:3] - there).T)
-        reach = _TUKEY * max(float(np.median(apart)), _LEAST_SPREAD_PX / 640)
+        weighted = equations.T * np.tile(weights, 2)
+        ridge = _RIDGE * weights.sum() * np.eye(equations.shape[1])
+        change = np.linalg.solve(weighted @ equations + ridge, weighted @ moved)
+        matrix[:2] = np.eye(4)[:2] + change[:8].reshape(2, 4)
+        matrix[2, [0, 1, 3]] = change[8:]
+        apart = _measure_distances(matrix, points, there)
+        reach = _TUKEY * max(float(np.median(apart)), _LEAST_SPREAD_PX * px)
         weights = np.maximum(1 - (apart / reach) ** 2, 0) ** 2
-    share = float((apart < _FOLLOWS_PX / 640).mean())
-    return matrix, share
+    return matrix
+
+
+def _measure_distances(
+    matrix: Float64[np.ndarray, "4 4"], points: Float64[np.ndarray, "n 4"], there: Float64[np.ndarray, "n 2"]
+) -> Float64[np.ndarray, " n"]:
+    """Return how far each point, moved by the matrix, is from where it is found."""
+    placed = points @ matrix.T
+    return np.hypot(*(placed[:, :2] / placed[:, 2:3] - there).T)

@@ -13,13 +13,14 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, UInt8
 
+from stereoweave.matching.edge_vote.vote import sharpen_edges
 from stereoweave.matching.left_right_check import find_occluded
 from stereoweave.stereo import Estimate, StereoPair
-from stereoweave.video.camera_motion import TrackedCorners, find_corners
+from stereoweave.video.camera_motion import TrackedCorners, find_camera_motion, find_corners
 from stereoweave.video.carried_kernels import Source, locate, take_pixels
 from stereoweave.video.frame_groups import FrameGroup
 from stereoweave.video.motion import convert_to_grey, halve, measure_motion
-from stereoweave.video.moved_points import find_camera_motion, move_points
+from stereoweave.video.moved_points import move_points
 from stereoweave.video.reader import StereoFrame
 from stereoweave.video.temporal_filter import FilteredFrame, TemporalFilter
 from stereoweave.video.temporal_kernels import Track
@@ -50,7 +51,10 @@ def carry_depth(
     """
     for (frames, pairs), estimate in matched:
         before, last = temporal_filter.last, pairs[-1]
-        steady = temporal_filter(last.left, last.right, estimate)
+        filtered = temporal_filter(last.left, last.right, sharpen_edges(last.left, estimate, threads))
+        # Pixels are filtered one by one, which frays edges.
+        steady = sharpen_edges(last.left, filtered, threads)
+        temporal_filter.replace_left(steady.disparity_px)
         carried = carry_between(pairs[:-1], before, temporal_filter.last, threads)
         yield from map(EstimatedFrame, frames, pairs, [*carried, steady])
 

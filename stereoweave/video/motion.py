@@ -17,7 +17,12 @@ _EXPLAINED, _LEAST_LEVELS, _NOISIEST_LEVELS = 1.5, 0.5, 6.0
 _REST, _REST_LEVELS = 1.1, 0.25
 # A pixel is calm if nothing moves in the window of this size around it.
 _CALM_PX = 9
-K_ALLOW, K_REST, K_RESTL, K_RESTC, K_MED = 0.3, 1.25, 0.5, 0.25, 5
+# Where the camera moves, images are resampled: differences may be larger by this share of the contrast. Such
+# motion explains the image if it differs by at most the second multiple, plus the third number of levels, of
+# what optical flow leaves, or by the fourth share of the contrast more. Speckles of this size are noise.
+_RESAMPLED = 0.3
+_MOVED, _MOVED_LEVELS, _MOVED_CONTRAST = 1.25, 0.5, 0.25
+_SPECKLE_PX = 5
 # This filter is zero on a plane. Gaussian noise with a standard deviation of one level gives a standard
 # deviation of 6 levels, and a median absolute value of 0.674 * 6 levels.
 _ROUGHNESS = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
@@ -90,16 +95,6 @@ def halve(grey: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h2 w2"]:
     return cv2.resize(grey, ((width + 1) // 2, (height + 1) // 2), interpolation=cv2.INTER_AREA)
 
 
-def find_flow(
-    before: UInt8[np.ndarray, "h2 w2"], grey: UInt8[np.ndarray, "h2 w2"]
-) -> Float[np.ndarray, "h2 w2 2"]:
-    """Return the offset from each pixel to its position in another image, in full-size pixels.
-
-    Both images are grey and have half the full size.
-    """
-    return 2 * _find_flow(_match_brightness(before, grey), grey).to_before_px
-
-
 def measure_motion(
     before: UInt8[np.ndarray, "h2 w2"],
     grey: UInt8[np.ndarray, "h2 w2"],
@@ -112,7 +107,7 @@ def measure_motion(
         grey: The image.
         camera_path: Where points would have been if only the camera moved; None if it rests.
     """
-    before = _match_brightness(before, grey)
+    before = match_brightness(before, grey)
     flow, least_levels, rests = _find_flow(before, grey)
     median_levels = min(float(np.median(least_levels[::4, ::4])), _NOISIEST_LEVELS)
     allowed_levels = _EXPLAINED * median_levels + _LEAST_LEVELS
@@ -122,20 +117,17 @@ def measure_motion(
     else:
         known = camera_path.known
         camera_levels = _measure_difference_levels(grey, _warp(before, camera_path.to_before_px / 2))
-        # Resampling errors grow with contrast.
-        allowed_levels = allowed_levels + K_ALLOW * _measure_contrast_levels(grey)
-        rests = known & (
-            camera_levels
-            <= np.maximum(
-                K_REST * least_levels + K_RESTL,
-                _REST * least_levels + K_RESTC * _measure_contrast_levels(grey),
-            )
+        contrast_levels = _measure_contrast_levels(grey)
+        allowed_levels = allowed_levels + _RESAMPLED * contrast_levels
+        as_well_levels = np.maximum(
+            _MOVED * least_levels + _MOVED_LEVELS, _REST * least_levels + _MOVED_CONTRAST * contrast_levels
         )
+        rests = known & (camera_levels <= as_well_levels)
         least_levels = np.where(known, np.minimum(least_levels, camera_levels), least_levels)
         flow[rests] = camera_path.to_before_px[rests] / 2
         explained = least_levels <= allowed_levels
-        # What the camera uncovers is new, but does not move. Speckles are noise.
-        moves = cv2.medianBlur((known & ~(rests & explained)).astype(np.uint8), K_MED).astype(bool)
+        # What the camera uncovers is new, but does not move.
+        moves = cv2.medianBlur((known & ~(rests & explained)).astype(np.uint8), _SPECKLE_PX).astype(bool)
     calm = cv2.erode((~moves).astype(np.uint8), np.ones((_CALM_PX, _CALM_PX), np.uint8)).astype(bool)
     return Motion(2 * flow, explained, calm, _measure_explained_share(grey, least_levels, explained), rests)
 
@@ -185,7 +177,7 @@ def _estimate_noise_levels(grey: UInt8[np.ndarray, "h2 w2"]) -> float:
     return float(np.median(np.abs(roughness[::4, ::4]))) / _MEDIAN_ROUGHNESS
 
 
-def _match_brightness(
+def match_brightness(
     before: UInt8[np.ndarray, "h2 w2"], grey: UInt8[np.ndarray, "h2 w2"]
 ) -> UInt8[np.ndarray, "h2 w2"]:
     """Return the previous image with the mean and contrast of the new image.

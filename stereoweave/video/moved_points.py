@@ -3,15 +3,11 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float64, UInt8
+from jaxtyping import Float64
 
-from stereoweave.video.camera_motion import TrackedCorners, fit_camera_motion
 from stereoweave.video.motion import CameraPath
 from stereoweave.video.splat_kernels import find_places, splat
 from stereoweave.video.temporal_kernels import Track
-
-# A camera that moves its picture by less than this rests.
-_LEAST_MOTION_PX = 0.1
 
 
 class MovedPoints(NamedTuple):
@@ -28,21 +24,14 @@ class MovedPoints(NamedTuple):
     path: CameraPath | None
 
 
-def find_camera_motion(
-    corners: TrackedCorners, grey: UInt8[np.ndarray, "h2 w2"]
-) -> Float64[np.ndarray, "4 4"] | None:
-    """Return the matrix of `fit_camera_motion`, or None if the camera rests or its motion is unknown."""
-    matrix = fit_camera_motion(corners, grey)
-    if matrix is None:
-        return None
-    points = corners.points * [corners.width_px, corners.width_px, 1, 0.1 * corners.width_px]
-    there = points @ matrix.T
-    moved_px = np.hypot(*(there[:, :2] / there[:, 2:3] - points[:, :2]).T)
-    return matrix if np.percentile(moved_px, 90) > _LEAST_MOTION_PX else None
-
-
 def move_points(matrix: Float64[np.ndarray, "4 4"] | None, track: Track, right: bool) -> MovedPoints:
-    """Move a view's points to another frame."""
+    """Return a view's points in another frame.
+
+    Args:
+        matrix: Motion of the camera (`find_camera_motion`); None if it rests.
+        track: Points of the view.
+        right: Whether the view is the right one.
+    """
     height, width = track.disparity_px.shape
     if matrix is None:
         return MovedPoints(np.full((height, width), -1, np.int32), np.zeros((1, 1, 2), np.float32), None)

@@ -2,8 +2,6 @@
 
 import typing
 
-import numpy as np
-
 from stereoweave.system.jit import kernel
 
 _IN_FRONT_PX = 1.0

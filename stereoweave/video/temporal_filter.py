@@ -16,15 +16,24 @@ from functools import partial
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Float32, UInt8
 
 from stereoweave.errors import StereoweaveError
+from stereoweave.matching.refine import right_confidence
 from stereoweave.stereo import Estimate
 from stereoweave.system.threads import thread_count
-from stereoweave.video.camera_motion import find_corners
-from stereoweave.video.moved_points import MovedPoints, find_camera_motion, move_points
+from stereoweave.video.camera_motion import find_camera_motion, find_corners
 from stereoweave.video.motion import CUT_SHARE, Motion, convert_to_grey, halve, measure_motion
-from stereoweave.video.temporal_kernels import SAME_PX, SAME_SHARE, Track, blend, carry, measure_drift
+from stereoweave.video.moved_points import MovedPoints, move_points
+from stereoweave.video.temporal_kernels import (
+    LEAST_WEIGHT,
+    SAME_PX,
+    SAME_SHARE,
+    Track,
+    blend,
+    carry,
+    measure_drift,
+)
 
 # If at least this share of the image is at rest, a majority of contradictions cannot be due to chance.
 _LEAST_ASKED_SHARE = 0.25
@@ -92,13 +101,9 @@ class TemporalFilter:
                 f"{list(right.shape[:2])}; pass the estimate of this pair"
             )
         before, self._greys = self._greys, [convert_to_grey(left), convert_to_grey(right)]
-        # The right view has no confidence; the placeholder is not returned.
-        confidences = (estimate.confidence, np.ones_like(estimate.confidence))
+        confidences = (estimate.confidence, right_confidence(estimate))
         disparities_px = (estimate.disparity_px, estimate.right_disparity_px)
-        new_tracks = [
-            Track(*maps, np.ones_like(maps[0]), np.zeros((*maps[0].shape, 2), np.float32))
-            for maps in zip(disparities_px, confidences, strict=True)
-        ]
+        new_tracks = [_begin_track(*maps) for maps in zip(disparities_px, confidences, strict=True)]
         continued = self._filter_tracks(before, new_tracks) if before else None
         if before and continued is None:
             self.cuts += 1
@@ -118,6 +123,10 @@ class TemporalFilter:
             return None
         (left_grey, right_grey), (left, right) = self._greys, self._tracks
         return FilteredFrame(left_grey, right_grey, left, right)
+
+    def replace_left(self, disparity_px: Float32[np.ndarray, "h w"]) -> None:
+        """Replace the left disparity of the last frame, with which the next one is filtered."""
+        self._tracks[0] = self._tracks[0]._replace(disparity_px=disparity_px)
 
     def state(self) -> dict[str, np.ndarray]:
         """Return the complete state as arrays for `np.savez`; a restored filter gives the same results."""
@@ -155,6 +164,20 @@ class TemporalFilter:
             if _is_contradicted(new_tracks, expected):
                 return None
             return list(pool.map(_update, new_tracks, expected))
+
+
+def _begin_track(disparity_px: Float[np.ndarray, "h w"], confidence: Float[np.ndarray, "h w"]) -> Track:
+    """Return the track of a view of the first frame."""
+    weights = np.maximum(confidence, LEAST_WEIGHT).astype(np.float32)
+    nothing = np.zeros_like(weights)
+    return Track(
+        disparity_px,
+        confidence.astype(np.float32),
+        weights,
+        np.zeros((*weights.shape, 2), np.float32),
+        nothing,
+        nothing,
+    )
 
 
 def _predict(

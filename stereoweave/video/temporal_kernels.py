@@ -8,6 +8,8 @@ from stereoweave.system.jit import kernel
 
 MOST_FRAMES = 12.0
 """Maximum number of frames in a mean. The limit lets the mean follow slow changes."""
+LEAST_WEIGHT = 0.1
+LEAST_RIVAL = 1.2
 SAME_PX, SAME_SHARE = 1.0, 0.02
 """Frames show the same surface if their disparities differ by at most SAME_PX + SAME_SHARE * disparity."""
 NEIGHBOUR_PX = 3.0
@@ -25,12 +27,16 @@ class Track(typing.NamedTuple):
         frames: Number of frames in the mean, minus the number that contradicted the mean afterwards; 0 where
             the disparity is unknown.
         offset_px: float32 [H, W, 2], place of the point to the right of and below the pixel's centre.
+        rival_px: Mean disparity over the frames that contradict the mean and agree with each other.
+        rival_frames: Number of these frames.
     """
 
     disparity_px: np.ndarray
     confidence: np.ndarray
     frames: np.ndarray
     offset_px: np.ndarray
+    rival_px: np.ndarray
+    rival_frames: np.ndarray
 
 
 @kernel
@@ -46,12 +52,15 @@ def carry(new_px, track, motion, source, source_offset_px, carried):
     old_px, old_confidence, old_frames = track.disparity_px, track.confidence, track.frames
     disparity_px, confidence, frames = carried.disparity_px, carried.confidence, carried.frames
     offset_px = carried.offset_px
+    old_rival_px, old_rival_frames = track.rival_px, track.rival_frames
+    rival_px, rival_frames = carried.rival_px, carried.rival_frames
     to_before_px, explained, calm, rests = motion.to_before_px, motion.explained, motion.calm, motion.rests
     height, width = new_px.shape
     for y in range(height):
         for x in range(width):
             i, j = y // 2, x // 2
             disparity_px[y, x] = confidence[y, x] = frames[y, x] = 0.0
+            rival_px[y, x] = rival_frames[y, x] = 0.0
             offset_px[y, x, 0] = offset_px[y, x, 1] = 0.0
             index = source[y, x]
             if index >= 0 and rests[i, j] and explained[i, j]:
@@ -59,6 +68,8 @@ def carry(new_px, track, motion, source, source_offset_px, carried):
                 disparity_px[y, x] = old_px[row, column]
                 confidence[y, x] = old_confidence[row, column]
                 frames[y, x] = old_frames[row, column]
+                rival_px[y, x] = old_rival_px[row, column]
+                rival_frames[y, x] = old_rival_frames[row, column]
                 offset_px[y, x, 0] = source_offset_px[y, x, 0]
                 offset_px[y, x, 1] = source_offset_px[y, x, 1]
                 continue
@@ -80,6 +91,8 @@ def carry(new_px, track, motion, source, source_offset_px, carried):
             disparity_px[y, x] = old_px[row, column]
             confidence[y, x] = old_confidence[row, column]
             frames[y, x] = old_frames[row, column]
+            rival_px[y, x] = old_rival_px[row, column]
+            rival_frames[y, x] = old_rival_frames[row, column]
 
 
 @kernel
@@ -121,24 +134,48 @@ def blend(new, carried, calm, drift_px, mean):
     old_px, old_confidence, old_frames = carried.disparity_px, carried.confidence, carried.frames
     disparity_px, confidence, frames = mean.disparity_px, mean.confidence, mean.frames
     old_offset_px, offset_px = carried.offset_px, mean.offset_px
+    old_rival_px, old_rival_frames = carried.rival_px, carried.rival_frames
+    rival_px, rival_frames = mean.rival_px, mean.rival_frames
     height, width = new_px.shape
     for y in range(height):
         for x in range(width):
-            expected_px = old_px[y, x] + drift_px[y // 2, x // 2]
+            change_px = drift_px[y // 2, x // 2]
+            expected_px = old_px[y, x] + change_px
+            same_px = SAME_PX + SAME_SHARE * abs(new_px[y, x])
             apart_px = new_px[y, x] - expected_px
+            weight = max(new_confidence[y, x], LEAST_WEIGHT)
             count = old_frames[y, x]
+            rival = old_rival_px[y, x] + change_px
+            rival_count = old_rival_frames[y, x]
             offset_px[y, x, 0], offset_px[y, x, 1] = old_offset_px[y, x, 0], old_offset_px[y, x, 1]
-            if count > 0 and abs(apart_px) > SAME_PX + SAME_SHARE * abs(new_px[y, x]):
-                if calm[y // 2, x // 2]:
-                    disparity_px[y, x] = expected_px
-                    confidence[y, x] = old_confidence[y, x] * count / (count + 1.0)
-                    frames[y, x] = count - 1.0
+            if count > 0 and abs(apart_px) > same_px:
+                if calm[y // 2, x // 2] or weight < 0.5 * old_confidence[y, x]:
+                    if rival_count > 0 and abs(new_px[y, x] - rival) <= same_px:
+                        rival_count += weight
+                        rival += weight / rival_count * (new_px[y, x] - rival)
+                    else:
+                        rival_count -= weight
+                        if rival_count <= 0:
+                            rival_count, rival = weight, new_px[y, x]
+                    lost = rival_count > max(count, LEAST_RIVAL)
+                    disparity_px[y, x] = rival if lost else expected_px
+                    frames[y, x] = rival_count if lost else count
+                    confidence[y, x] = (
+                        new_confidence[y, x] if lost else old_confidence[y, x] * count / (count + weight)
+                    )
+                    rival_px[y, x] = expected_px if lost else rival
+                    rival_frames[y, x] = count if lost else rival_count
+                    if lost:
+                        offset_px[y, x, 0] = offset_px[y, x, 1] = 0.0
                     continue
                 count = 0.0
             if count == 0.0:
                 offset_px[y, x, 0] = offset_px[y, x, 1] = 0.0
-            count = min(count + 1.0, MOST_FRAMES)
-            share = 1.0 / count
+            rival_px[y, x], rival_frames[y, x] = rival, max(rival_count - 0.5 * weight, 0.0)
+            if count == 0.0:
+                rival_frames[y, x] = 0.0
+            count = min(count + weight, MOST_FRAMES)
+            share = weight / count
             disparity_px[y, x] = new_px[y, x] - (1.0 - share) * apart_px
             confidence[y, x] = old_confidence[y, x] + share * (new_confidence[y, x] - old_confidence[y, x])
             frames[y, x] = count

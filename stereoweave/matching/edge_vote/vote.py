@@ -23,6 +23,9 @@ _SPECKLE_PIXELS, _SPECKLE_STEP_PX = 100, 1
 _LARGE_SPECKLE_PIXELS, _DOUBTED = 400, 0.5
 # Disparities less confident than this are replaced.
 _UNSURE = 0.2
+# Things into which no square of this size fits are thin, if the image shows lines there: of at least this
+# difference in grey levels from what is around them, several times the noise of a video.
+_THIN_PX, _LINE_LEVELS = 7, 24
 # Number of rounds; each one reaches 4 px farther into areas without sound disparities, as on plain surfaces.
 _ROUNDS = 16
 # Confidence of a replaced disparity if both cameras see the pixel, and if one does, plus these shares of its
@@ -48,8 +51,30 @@ def vote_at_edges(
         estimate: The pair's estimate.
         threads: Maximum number of threads; default: all cores.
     """
-    disparity_px, confidence = _vote(image, estimate, threads)
+    unsound = _find_unsound(
+        np.asarray(estimate.disparity_px, np.float32), np.asarray(estimate.confidence, np.float32)
+    )
+    disparity_px, confidence = _vote(image, estimate, unsound, threads)
     return replace(estimate, disparity_px=disparity_px, confidence=confidence)
+
+
+def sharpen_edges(
+    image: UInt8[np.ndarray, "h w 3"], estimate: Estimate, threads: int | None = None
+) -> Estimate:
+    """Replace the left disparities at edges by their neighbours' vote, but for thin things.
+
+    Confidences do not change. This takes half the time of `vote_at_edges`, which removes thin things as
+    speckles.
+
+    Args:
+        image: Left image, uint8 RGB [H, W, 3].
+        estimate: The pair's estimate.
+        threads: Maximum number of threads; default: all cores.
+    """
+    disparity_px = np.asarray(estimate.disparity_px, np.float32)
+    unsound = _find_steps(disparity_px) & ~_find_thin(image, disparity_px, estimate.confidence)
+    sharp_px, _ = _vote(image, estimate, unsound, threads)
+    return replace(estimate, disparity_px=sharp_px)
 
 
 def rehearse_voting() -> None:
@@ -60,16 +85,18 @@ def rehearse_voting() -> None:
 
 
 def _vote(
-    image: UInt8[np.ndarray, "h w 3"], estimate: Estimate, threads: int | None
+    image: UInt8[np.ndarray, "h w 3"],
+    estimate: Estimate,
+    unsound: Bool[np.ndarray, "h w"],
+    threads: int | None,
 ) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
-    """Return the disparities and confidences after all rounds."""
+    """Return the disparities and confidences after all rounds; `unsound` becomes the pixels without a vote."""
     from stereoweave.matching.edge_vote.vote_kernels import vote  # it loads LLVM
 
     lab = cv2.cvtColor(image.astype(np.float32) / 255, cv2.COLOR_RGB2LAB)
     disparity_px = np.array(estimate.disparity_px, np.float32)
     claimed = np.array(estimate.confidence, np.float32)
     confidence = claimed.copy()
-    unsound = _find_unsound(disparity_px, claimed)
     kept = ~unsound
     bands = thread_count(threads)
     for _ in range(_ROUNDS):
@@ -91,13 +118,30 @@ def _find_unsound(
     disparity_px: Float32[np.ndarray, "h w"], confidence: Float32[np.ndarray, "h w"]
 ) -> Bool[np.ndarray, "h w"]:
     """Return the mask of the pixels at edges, in speckles and of low confidence."""
-    around = np.ones((3, 3), np.uint8)
-    steps = cv2.dilate(disparity_px, around) - cv2.erode(disparity_px, around) > _STEP_PX
     parts = np.rint(_PARTS_OF_PX * (disparity_px - disparity_px.min() + 1))
     whole = np.minimum(parts, np.iinfo(np.int16).max).astype(np.int16)
     speckles = _find_speckles(whole, _SPECKLE_PIXELS)
     speckles |= (confidence < _DOUBTED) & _find_speckles(whole, _LARGE_SPECKLE_PIXELS)
-    return steps | speckles | (confidence < _UNSURE)
+    return _find_steps(disparity_px) | speckles | (confidence < _UNSURE)
+
+
+def _find_steps(disparity_px: Float32[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Return the mask of the pixels at edges."""
+    around = np.ones((3, 3), np.uint8)
+    return cv2.dilate(disparity_px, around) - cv2.erode(disparity_px, around) > _STEP_PX
+
+
+def _find_thin(
+    image: UInt8[np.ndarray, "h w 3"],
+    disparity_px: Float32[np.ndarray, "h w"],
+    confidence: Float32[np.ndarray, "h w"],
+) -> Bool[np.ndarray, "h w"]:
+    """Return the mask of the pixels of thin things that are not quite unsure and that the image shows too."""
+    around = np.ones((_THIN_PX, _THIN_PX), np.uint8)
+    before_px = disparity_px - cv2.morphologyEx(disparity_px, cv2.MORPH_OPEN, around)
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    lines = [cv2.morphologyEx(grey, kind, around) for kind in (cv2.MORPH_TOPHAT, cv2.MORPH_BLACKHAT)]
+    return (before_px > _STEP_PX) & (np.maximum(*lines) > _LINE_LEVELS) & (confidence > _UNSURE)
 
 
 def _find_speckles(parts: Int16[np.ndarray, "h w"], pixels: int) -> Bool[np.ndarray, "h w"]:
