@@ -18,6 +18,7 @@ OUTPUTS: Mapping[str, Sequence[str]] = {
     "side_by_side": ["--layout", "side_by_side"],
     "anaglyph": ["--layout", "anaglyph_dubois"],
     "depth": ["--depth"],
+    "vr180_window": ["--layout", "side_by_side", "--projection", "half_equirectangular", "--look", "20,0"],
 }
 
 
