@@ -22,8 +22,8 @@ def whole_films(
 ) -> None:
     """Convert a film by `stereoweave video` and compare its frames, times and sound with the original's.
 
-    It is converted to side_by_side, anaglyph, depth, and vr180_window, a window as if it were VR180, each in a
-    process of its own.
+    It is converted to side_by_side, anaglyph, depth, and vr180_window, a window as if it were VR180, each in
+    a process of its own.
     """
     from experiments.whole_films.conversion import measure_conversions
 
