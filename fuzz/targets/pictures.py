@@ -1,6 +1,7 @@
 """Pictures with one or two views, in every supported format, with tags, profiles and markers."""
 
 import io
+import json
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -8,6 +9,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import tifffile
 from PIL import Image, ImageCms, features
 from pillow_heif import HeifFile
 
@@ -45,6 +47,8 @@ def _starts() -> dict[str, bytes]:
         "eyes.mpo": write_to_bytes("eyes.mpo", lambda path: write_picture(path, both)),
         "eyes.jps": write_to_bytes("eyes.jps", lambda path: write_picture(path, both)),
         "eyes.heic": _encode_heic(left, right),
+        "leia.jpg": _encode_lif(left, right),
+        "sensor.dng": _encode_dng(left),
         "above_TB.png": encode_picture(np.vstack([left, right]), "PNG"),
     }
 
@@ -58,6 +62,38 @@ def _encode_heic(*images: np.ndarray) -> bytes:
         added = file.add_frombytes("RGB", image.shape[1::-1], image.tobytes())
         added.info["exif"] = exif.tobytes()
     file.save(stream)
+    return stream.getvalue()
+
+
+def _encode_lif(left: np.ndarray, right: np.ndarray) -> bytes:
+    """Return a LIF file: a JPEG, then a table with the right view and the description of both."""
+    views = [
+        {"image": {"blob_id": number}, "width_px": 72, "focal_px": 60, "position": {"x": x, "y": 0, "z": 0}}
+        for number, x in ((-1, 0.0), (1000001, 1.0))
+    ]
+    fields = {
+        1000001: encode_picture(right, "JPEG"),
+        8: json.dumps({"baseline_mm": 45, "views": views}).encode(),
+    }
+    table = len(fields).to_bytes(4) + b"".join(
+        kind.to_bytes(4) + len(content).to_bytes(4) + content for kind, content in fields.items()
+    )
+    return encode_picture(left, "JPEG") + table + (len(table) + 6).to_bytes(4) + b"\x1e\x1a"
+
+
+def _encode_dng(image: np.ndarray) -> bytes:
+    """Return a raw file, whose sensor sees the image's first channel."""
+    stream = io.BytesIO()
+    matrix = [part for value in np.eye(3).ravel() for part in (round(1000 * value), 1000)]
+    tags = [
+        (272, "s", 0, "Some camera", True),
+        (33421, "H", 2, (2, 2), True),
+        (33422, "B", 4, (0, 1, 1, 2), True),
+        (50706, "B", 4, (1, 4, 0, 0), True),
+        (50721, "2i", 9, matrix, True),
+    ]
+    values = image[..., 0].astype(np.uint16) << 8
+    tifffile.imwrite(stream, values, photometric=32803, extratags=tags, software=False, metadata=None)
     return stream.getvalue()
 
 
@@ -101,7 +137,7 @@ TARGET = Target(
         *b"IHDR IDAT IEND tRNS PLTE acTL eXIf iCCP II*\0 MM\0* RIFF VP8L ANIM GIF89a P6 BM ftypavif".split(),
         *b"ftypheic meta iloc iinf infe iprp ipco ipma ispe hvcC irot grpl ster idat mdat".split(),
         *(b"\xff\xd8", b"\xff\xd9", b"\xff\xe1", b"\xff\xe2MPF\0", b"\xff\xe3_JPSJPS_", b"Exif\0\0", b"jP  "),
-        *(b"\x21\xf9\x04", b"\x2c", b"acsp", b"GImage:"),
+        *(b"\x21\xf9\x04", b"\x2c", b"acsp", b"GImage:", b"\x1e\x1a", b"blob_id", b"views", b"\x12\xc6"),
     ),
     repair=repair_png,
 )

@@ -8,7 +8,7 @@ from pathlib import Path
 import av
 import numpy as np
 
-from fuzz.targets import Target, write_to_bytes
+from fuzz.targets import Target, read_every_way, write_to_bytes
 from fuzz.targets.pictures import eyes
 from stereoweave.video.reader import open_video
 from stereoweave.video.tracks import is_spatial_file, open_track
@@ -26,7 +26,25 @@ _PIXELS = {"ffv1": "bgr0", "mjpeg": "yuvj420p"}
 
 def _starts() -> dict[str, bytes]:
     written = {name: write_to_bytes(name, partial(_write, codec=codec)) for name, codec in _KINDS.items()}
-    return written | {_SPATIAL.name: _SPATIAL.read_bytes()}
+    twins = {"streams.avi": write_to_bytes("streams.avi", _write_twins)}
+    return written | twins | {_SPATIAL.name: _SPATIAL.read_bytes()}
+
+
+def _write_twins(path: Path) -> None:
+    """Write a video with a stream for each view."""
+    with av.open(str(path), "w") as container:
+        streams = [container.add_stream("mjpeg", rate=25) for _ in range(2)]
+        for stream in streams:
+            assert isinstance(stream, av.VideoStream)
+            stream.height, stream.width, stream.pix_fmt = *eyes()[0].shape[:2], "yuvj420p"
+        for index, images in enumerate(map(eyes, range(_FRAMES))):
+            for stream, image in zip(streams, images, strict=True):
+                assert isinstance(stream, av.VideoStream)
+                frame = av.VideoFrame.from_ndarray(image, "rgb24")
+                frame.pts, frame.time_base = index, Fraction(1, 25)
+                container.mux(stream.encode(frame))
+        for stream in streams:
+            container.mux(stream.encode())
 
 
 def _write(path: Path, codec: str) -> None:
@@ -45,10 +63,16 @@ def _write(path: Path, codec: str) -> None:
 
 def _read(path: Path) -> None:
     # Detection would take most of the time; the target for pictures covers it.
-    video = open_video([path], None if is_spatial_file(path) else "side_by_side")
-    for _ in islice(video.frames(), 2 * _FRAMES):
-        pass
+    format = None if is_spatial_file(path) else "side_by_side"
+    read_every_way(
+        *(partial(_read_frames, path, each) for each in (format, "two_streams", "frame_sequential"))
+    )
     open_track(path, None).samples()
+
+
+def _read_frames(path: Path, format: str | None) -> None:
+    for _ in islice(open_video([path], format).frames(), 2 * _FRAMES):
+        pass
 
 
 TARGET = Target(

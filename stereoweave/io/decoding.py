@@ -74,15 +74,18 @@ def open_picture(
     check_regular(path, expected)
     check_readable(path, expected)
     with _decoding(path, expected), path.open("rb") as file:
-        brands = _find_brands(file.read(64))
-    _refuse_by_name(path, brands)
+        head = file.read(64)
+    brands = _find_brands(head)
+    is_raw = raw.is_raw(path, head)
+    if not is_raw:
+        _refuse_by_name(path, brands)
     if views == 2 and brands & _AVIF_BRANDS and heif.has_stereo_group(path):
         raise FormatError(
             f"{path}: expected {A_PICTURE}, found an AVIF file with a left and a right view, of which Pillow "
             "reads one alone; save both as separate pictures, or as HEIC"
         )
     with _decoding(path, expected):
-        picture, sizes_px = _open_any(path, brands, views)
+        picture, sizes_px = _open_any(path, brands, views, is_raw=is_raw)
     with picture:
         # The sizes of all pictures: Pillow allocates memory when it seeks one.
         for size_px in (picture.size, *sizes_px):
@@ -211,11 +214,13 @@ def _describe_other(path: str | Path) -> str:
     return "an empty file; copy it again" if is_empty else "another type of file; save it as PNG or JPEG"
 
 
-def _open_any(path: Path, brands: set[bytes], views: int) -> tuple[Image.Image, list[tuple[int, int]]]:
-    """Open a picture of any format; return it, and the sizes that it states beside its own."""
-    if path.suffix.lower() in raw.ENDINGS:
-        developed = raw.open_raw(path)
-        return developed, [developed.sensor_size_px]
+def _open_any(
+    path: Path, brands: set[bytes], views: int, *, is_raw: bool
+) -> tuple[Image.Image, list[tuple[int, int]]]:
+    """Open a picture; return it, and the sizes that it states beside its own."""
+    if is_raw:
+        picture = raw.open_raw(path)
+        return picture, [picture.sensor_size_px]
     if not brands & _AVIF_BRANDS and brands & heif.BRANDS:
         return heif.open_heif(path), heif.read_sizes(path)
     return _open(path, path, views), []
@@ -251,7 +256,7 @@ def _refuse_by_name(path: Path, brands: set[bytes]) -> None:
             raise FormatError(
                 f"{path}: expected {A_PICTURE}, found AVIF, which the installed Pillow cannot read"
             )
-    elif ending not in raw.ENDINGS and not brands & heif.BRANDS and (brands or ending in _VIDEO_ENDINGS):
+    elif not brands & heif.BRANDS and (brands or ending in _VIDEO_ENDINGS):
         raise FormatError(
             f"{path}: expected {A_PICTURE}, found a video", remedy=Remedy("convert it as such", ("video",))
         )

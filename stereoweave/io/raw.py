@@ -1,5 +1,7 @@
 """Camera raw files, which rawpy (LibRaw) develops: colours, size and orientation."""
 
+import warnings
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +17,39 @@ ENDINGS = frozenset(
     }
 )
 FORMAT = "RAW"
+# Of Fujifilm, Panasonic, Olympus (three), Sigma and Minolta.
+_BEGINNINGS = (b"FUJIFILMCCD-RAW", b"IIU\0", b"IIRO", b"IIRS", b"MMOR", b"FOVb", b"\0MRM")
+_TIFF = (b"II*\0", b"MM\0*")
+# Tags of TIFF and DNG, and the value of a colour filter array.
+_SUBFILE_TYPE, _PHOTOMETRIC, _SUBDIRECTORIES, _DNG_VERSION, _FILTER_ARRAY = 254, 262, 330, 50706, 32803
 # The exponent and the slope of sRGB's curve.
 _SRGB_CURVE = (2.4, 12.92)
 # LibRaw's turns by a quarter have this bit.
 _QUARTER_TURN = 4
 _EXIF, _LONGEST_SEGMENT = b"Exif\0\0", 65_533  # of a JPEG
 _LAST_ROWS_SHARE = 32
+
+
+def is_raw(path: Path, head: bytes) -> bool:
+    """Return whether a file is a raw one, by its ending, its first 64 bytes or, of a TIFF file, its tags."""
+    if path.suffix.lower() in ENDINGS or head.startswith(_BEGINNINGS):
+        return True
+    is_canon = head[6:14] == b"HEAPCCDR" or head[8:10] == b"CR" or head[4:12] == b"ftypcrx "
+    return is_canon or (head.startswith(_TIFF) and _has_raw_tags(path))
+
+
+def _has_raw_tags(path: Path) -> bool:
+    """Return whether a TIFF file is a raw file, of which Pillow would open a preview, if anything.
+
+    It is DNG, or a colour filter array, or its first picture is a smaller copy of one in a subdirectory.
+    """
+    tags = Image.Exif()
+    # Damaged tags may raise any exception, and warnings; the file is then opened as an ordinary TIFF file.
+    with suppress(Exception), warnings.catch_warnings(action="ignore"), path.open("rb") as file:
+        tags.load_from_fp(file)
+        is_preview = tags.get(_SUBFILE_TYPE) == 1 and _SUBDIRECTORIES in tags
+        return _DNG_VERSION in tags or tags.get(_PHOTOMETRIC) == _FILTER_ARRAY or is_preview
+    return False
 
 
 class RawImage(Image.Image):

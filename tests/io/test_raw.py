@@ -85,6 +85,29 @@ def test_a_raw_file_tells_its_camera(tmp_path):
         assert 0x0112 not in picture.getexif()
 
 
+def test_a_raw_file_is_recognised_without_its_ending(tmp_path):
+    """The service stores uploads without one. Pillow would open the sensor's values as a grey picture."""
+    path = write_dng(tmp_path / "a.dng", patches()).rename(tmp_path / "left")
+    np.testing.assert_allclose(np.array(read_picture(path).image)[16, 24], (188, 89, 89), atol=1)
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        *(b"FUJIFILMCCD-RAW 0201", b"IIU\0\x18\0\0\0", b"IIRO\x08\0\0\0", b"MMOR\0\0\0\x08", b"FOVb\0\0\2\0"),
+        *(
+            b"II\x1a\0\0\0HEAPCCDR",
+            b"II*\0\x10\0\0\0CR\2\0",
+            b"\0\0\0\x18ftypcrx \0\0\0\1crx isom",
+            b"\0MRM\0",
+        ),
+    ],
+)
+def test_raw_files_of_other_makers_are_recognised_by_their_beginning(tmp_path, head):
+    (tmp_path / "left").write_bytes(head + bytes(500))
+    assert "found a camera raw file that LibRaw cannot read (" in refusal(tmp_path / "left")
+
+
 def test_a_raw_file_with_a_picture_of_its_name_is_left_out_of_a_folder():
     pairs = find_pairs_among(
         "shots", ["a_L.dng", "a_R.dng", "b_L.jpg", "b_L.NEF", "b_R.jpg", "b_R.NEF"]
