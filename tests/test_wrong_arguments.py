@@ -95,6 +95,7 @@ def calls() -> list[Call]:
     storage = cv2.FileStorage("all.yml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     place = {"up": 0.1, "forward": 0.1}
     look = {"strength": 1.0, "convergence_px": 1.0}
+    fine = LEFT.astype(np.float32), RIGHT.astype(np.float32)
     return [
         Call("estimate", sw.estimate, **pair, **how, **steps, range_px=(0, 20), align="auto"),
         Call("Matcher", sw.Matcher, **how),
@@ -102,7 +103,8 @@ def calls() -> list[Call]:
         Call("Matcher.estimate_many", matcher.estimate_many, pairs=[PAIR], **steps),
         Call("render", sw.render, **pair, estimate=FOUND, position=0.5, threads=1, **look, **place),
         Call("render with camera", sw.render, **pair, estimate=FOUND, position=0.5, up=0.1, camera=CAMERA),
-        Call("Renderer", Renderer, pair=PAIR, estimate=FOUND, **look, threads=1),
+        Call("Renderer", Renderer, pair=PAIR, estimate=FOUND, **look, threads=1, fine=fine),
+        Call("Renderer.fine_view", Renderer(PAIR, FOUND, threads=1, fine=fine).fine_view, position=0.0),
         Call("Renderer.view", Renderer(PAIR, FOUND, threads=1).view, position=0.5, **place),
         Call("fit_screen", sw.fit_screen, estimate=FOUND, screen="phone", **look),
         Call("synthesize", sw.synthesize, **pair, position=0.5, **how),

@@ -56,6 +56,7 @@ class Renderer:
     ) -> None:
         check_fits(estimate, pair)
         _check_shifts(strength, convergence_px, pair)
+        _check_fine(fine, pair)
         self.pair, self.estimate = pair, estimate
         self.strength, self.convergence_px, self.fine = strength, convergence_px, fine
         self._threads = min(_MOST_THREADS, thread_count(threads))
@@ -97,7 +98,8 @@ class Renderer:
 
     def fine_view(self, position: float) -> Float32[np.ndarray, "h w 3"]:
         """Render the view from a position in the bits of `fine`, from 0 to 255; see `view`."""
-        assert self.fine is not None
+        if self.fine is None:
+            raise StereoweaveError("fine: expected two pictures for a view in more than 8 bits, found none")
         position = check_position(position, strength=self.strength)
         if position in (0, 1) and not self.convergence_px:
             return self.fine[int(position)].copy()
@@ -231,6 +233,17 @@ def _check_shifts(strength: float, convergence_px: float, pair: StereoPair) -> N
         raise StereoweaveError(
             f"expected -{width} to {width} px (the picture's width), got {convergence_px}",
             setting="convergence_px",
+        )
+
+
+def _check_fine(fine: object, pair: StereoPair) -> None:
+    if fine is None:
+        return
+    images = fine if isinstance(fine, tuple) else ()
+    shape = pair.left.shape
+    if [(getattr(x, "dtype", None), getattr(x, "shape", None)) for x in images] != [(np.float32, shape)] * 2:
+        raise StereoweaveError(
+            f"fine: expected a tuple of two float32 arrays {list(shape)}, found {type(fine).__name__}"
         )
 
 
