@@ -125,14 +125,19 @@ class ScreenChoice:
 
     def describe(self, fit: ScreenFit) -> str:
         """Return a line that says what was chosen, what was given, and whether the depth is comfortable."""
+        return f"{self.name}: {fit.describe()}{self.describe_rest(fits=fit.fits)}"
+
+    def describe_rest(self, *, fits: bool) -> str:
+        """Return what the line ends in: what was given, and the budget if the depth does not fit it."""
         given = {"strength": self.strength, "convergence": self.convergence_px}
         names = [name for name, value in given.items() if value is not None]
-        parts = [fit.describe(), *([f"{' and '.join(names)} as given"] if names else [])]
-        if not fit.fits:
+        parts = [f"; {' and '.join(names)} as given"] if names else []
+        if not fits:
             screen = SCREENS[self.name]
-            most = format_depth(screen.front_percent, screen.behind_percent)
-            parts.append(f"comfortable would be {most}")
-        return f"{self.name}: {'; '.join(parts)}"
+            parts.append(
+                f"; comfortable would be {format_depth(screen.front_percent, screen.behind_percent)}"
+            )
+        return "".join(parts)
 
 
 def find_screen(name: str) -> Screen:

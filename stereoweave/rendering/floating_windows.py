@@ -21,6 +21,8 @@ _LEAST_PERCENT = 0.2
 # An object must reach the border in this share of the rows.
 _LEAST_ROWS_SHARE = 0.02
 _WIDEST_PERCENT = 6.0
+# About this many rows, evenly spread, are enough.
+_MOST_ROWS = 240
 _NEAREST_PERCENT = 0.2
 
 
@@ -69,6 +71,7 @@ def _find_bar_px(disparity_px: Float[np.ndarray, "h w"], strength: float, conver
 
     The view's columns are those of the left image, moved as `Renderer` moves them.
     """
+    disparity_px = disparity_px[:: max(1, len(disparity_px) // _MOST_ROWS)]
     height, width = disparity_px.shape
     border_px = max(2.0, _BORDER_PERCENT / 100 * width)
     position = 0.5 - strength / 2

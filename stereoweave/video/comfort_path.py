@@ -35,6 +35,8 @@ _PLANE_S, _PLANE_PERCENT_PER_S = 0.5, 1.0
 _STRENGTH_S, _FALL_PER_S, _RISE_PER_S = 0.5, 0.25, 0.05
 _WINDOW_S, _WINDOW_PERCENT_PER_S = 0.2, 6.0
 _LEAST_STRENGTH = 1e-3
+# What is written as 0.0 % more than the budget is no more.
+_TOLERATED_PERCENT = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,7 +144,13 @@ class ComfortPath:
         strength = _format_ends("{:.2f}", extent.least_strength, extent.greatest_strength)
         plane = _format_ends("{:.1f}", *planes_px)
         depth = format_depth(extent.front, extent.behind)
-        return f"{self._choice.name}: strength {strength}, convergence {plane} px, depth {depth}"
+        screen = self._screen
+        fits = (
+            extent.front <= screen.front_percent + _TOLERATED_PERCENT
+            and extent.behind <= screen.behind_percent + _TOLERATED_PERCENT
+        )
+        ending = self._choice.describe_rest(fits=fits)
+        return f"{self._choice.name}: strength {strength}, convergence {plane} px, depth {depth}{ending}"
 
     def _move(self, pose: _Pose, depth: Depth, given: float | None, passed_s: float | None) -> None:
         """Move strength and convergence towards what fits; `passed_s` is None where a shot begins."""

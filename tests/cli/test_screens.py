@@ -7,6 +7,7 @@ from PIL import Image
 from stereoweave.cli.root import main
 from stereoweave.io.images import read_image
 from stereoweave.matching.matcher import Matcher
+from stereoweave.rendering.comfort import SCREENS
 
 
 @pytest.fixture
@@ -65,6 +66,13 @@ def test_a_screen_needs_a_layout_of_several_views(flat, monkeypatch, capsys, wor
     line = capsys.readouterr().err
     assert all(fragment in line for fragment in fragments)
     assert line.count("\n") == 1
+
+
+@pytest.mark.parametrize("command", ["view", "video", "check"])
+def test_the_help_names_all_screens(command, capsys):
+    assert main([command, "--help"]) == 0
+    words = " ".join(capsys.readouterr().out.split())
+    assert all(screen in words for screen in SCREENS)
 
 
 @pytest.mark.parametrize("screen", ["tv", "Phone", "-1"])

@@ -136,6 +136,16 @@ def test_a_path_of_no_frames_is_restored_too():
     assert first.strength == 0.5
 
 
+def test_the_description_says_what_was_given_and_what_is_too_much_for_a_moment():
+    path = ComfortPath(ScreenChoice(name="television", strength=1.0))
+    # 10 px come 25 px near within a frame: 1 % is 10 px, and the screen has moved by 0.4 px only.
+    play(path, [estimate_of(10.0, 10.0), estimate_of(35.0, 10.0)])
+    assert path.describe(WIDTH) == (
+        "television: strength 1.00, convergence 10.0 to 10.4 px, depth -2.5 % to +0.0 % of the width; "
+        "strength as given; comfortable would be -1.0 % to +2.0 % of the width"
+    )
+
+
 def test_the_description_gives_all_values():
     path = ComfortPath(TELEVISION)
     play(path, [estimate_of(70.0, 10.0), estimate_of(8.0, 8.0)], cuts=[1])
