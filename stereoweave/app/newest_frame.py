@@ -23,8 +23,11 @@ if TYPE_CHECKING:
 
 _LONGER_SIDE_PX = 640
 _JPEG_QUALITY = 80
-# Pictures follow each other after this time, and later if they would cost more than this share of one core.
-_LEAST_S, _MOST_SHARE = 0.25, 0.04
+# The left view's width if another output than the conversion's is rendered, which takes the longest.
+_RENDERED_PX = 448
+# Pictures follow each other after this time, and later if they would take more than this share of the time;
+# on two cores, 5 % of both.
+_LEAST_S, _MOST_SHARE = 0.25, 0.1
 
 
 @dataclass(frozen=True)
@@ -62,7 +65,7 @@ def make_pictures(
         longer_side_px: The longer side of each picture.
     """
     fitted = longer_side_px, longer_side_px
-    picture = converted.picture if job is None else _render_small(converted, job, fitted)
+    picture = converted.picture if job is None else _render_small(converted, job)
     time_s = begin_s + float(converted.frame.time)
     return FramePictures(time_s, output, _encode(converted.frame.left, fitted), _encode(picture, fitted))
 
@@ -135,11 +138,12 @@ class FrameShower:
         """Show a frame, unless another one was shown just before."""
         if time.monotonic() < self._next_s:
             return
-        begin_s = time.thread_time()
+        begin_s = time.monotonic()
         with suppress(Exception):
             self._show(converted)
-        spent_s = time.thread_time() - begin_s
-        self._next_s = time.monotonic() + max(_LEAST_S, spent_s / _MOST_SHARE)
+        end_s = time.monotonic()
+        # Not the processor's time, because threads of the renderer draw.
+        self._next_s = end_s + max(_LEAST_S, (end_s - begin_s) / _MOST_SHARE)
 
     def _show(self, converted: "ConvertedFrame") -> None:
         output = self._newest.asked() or self._output
@@ -147,13 +151,11 @@ class FrameShower:
         self._newest.write(make_pictures(converted, output, job, begin_s=self._begin_s))
 
 
-def _render_small(
-    converted: "ConvertedFrame", job: "VideoJob", fitted: tuple[int, int]
-) -> UInt8[np.ndarray, "h w 3"]:
+def _render_small(converted: "ConvertedFrame", job: "VideoJob") -> UInt8[np.ndarray, "h w 3"]:
     """Render an output of a frame scaled down, whose pair regains the proportions that it was read with."""
     from stereoweave.video.frame_renderer import FrameRenderer  # it loads PyAV
 
-    size_px = fit_size(converted.frame.left.shape, fitted)
+    size_px = fit_size(converted.frame.left.shape, (_RENDERED_PX, _RENDERED_PX))
     scale = size_px[0] / converted.pair.left.shape[1]
     pair, estimate = scale_down(converted.pair, converted.estimate, size_px)
     return FrameRenderer(job, _scale_survey(converted.survey, scale))(pair, estimate)
