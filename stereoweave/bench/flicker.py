@@ -21,6 +21,7 @@ from stereoweave.bench.flicker_videos import (
     RenderedVideo,
     add_noise,
     add_passing_oval,
+    expose,
     freeze,
     render_panning,
 )
@@ -41,6 +42,8 @@ FRAME_BY_FRAME, STEADY, CARRIED = "frame by frame", "steady", "carried"
 # Length of the whole camera path: five seconds.
 _PATH_FRAMES = 120
 _BAD_PX = 2.0
+# Brightness of a flash, and of the last frame of a fade, as multiples.
+_FLASH, _FADED = 1.8, 0.3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,7 +111,7 @@ def score_flicker(  # noqa: PLR0913 - each is an option of the command line
     threads: int | None = None,
     provider: str = CPU,
 ) -> Iterator[FlickerRow]:
-    """Yield three rows for each of the four videos of each scene.
+    """Yield three rows for each of the six videos of each scene.
 
     They are without the temporal filter, with it, and with depth carried between matched frames, as in a
     conversion.
@@ -176,6 +179,12 @@ def _render_videos(spec: RenderSpec, frames: int) -> Iterator[RenderedVideo]:
     yield add_passing_oval(pan, "passing", (3.25, 0.75))
     yield add_passing_oval(pan, "nearing", (0.25, 0.0), nearing_px=0.5)
     yield pan
+    # The flash is in a frame that is matched where every third one is.
+    flash = [
+        _FLASH if frame == frames // 2 // MATCHED_EVERY * MATCHED_EVERY else 1.0 for frame in range(frames)
+    ]
+    yield expose(pan, "flash", flash)
+    yield expose(pan, "fade", np.linspace(1, _FADED, frames).tolist())
 
 
 def _run_methods(

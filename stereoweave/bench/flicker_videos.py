@@ -1,8 +1,8 @@
-"""Rendered videos with known motion: a still scene, a passing object and a moving camera."""
+"""Rendered videos with known motion: a still scene, a passing object, a moving camera, a flash and a fade."""
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -179,6 +179,19 @@ def add_passing_oval(
         moving=[views[LEFT][1] for views in shown],
         change=change,
     )
+
+
+def expose(video: RenderedVideo, name: str, gains: Sequence[float]) -> RenderedVideo:
+    """Return the video with each frame's brightness multiplied by a gain."""
+
+    def brighten(image: UInt8[np.ndarray, "h w 3"], gain: float) -> UInt8[np.ndarray, "h w 3"]:
+        return np.rint(gain * image).clip(0, 255).astype(np.uint8)
+
+    pairs = [
+        StereoPair(left=brighten(pair.left, gain), right=brighten(pair.right, gain))
+        for pair, gain in zip(video.pairs, gains, strict=True)
+    ]
+    return replace(video, name=name, pairs=pairs)
 
 
 def _paste_oval(

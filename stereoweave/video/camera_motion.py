@@ -53,9 +53,9 @@ def find_corners(grey: UInt8[np.ndarray, "h2 w2"], disparity_px: Float[np.ndarra
     strength = cv2.cornerMinEigenVal(grey, _CORNER_PX)
     height, width = (side // _CELL_PX for side in strength.shape)
     cells = strength[: height * _CELL_PX, : width * _CELL_PX].reshape(height, _CELL_PX, width, _CELL_PX)
-    cells = cells.transpose(0, 2, 1, 3).reshape(height, width, _CELL_PX**2)
-    within = np.array(np.divmod(cells.argmax(2), _CELL_PX))
-    rows, columns = (_CELL_PX * np.indices((height, width)) + within)[:, cells.max(2) > _LEAST_CORNER]
+    by_cell = cells.transpose(0, 2, 1, 3).reshape(height, width, _CELL_PX**2)
+    within = np.array(np.divmod(by_cell.argmax(2), _CELL_PX))
+    rows, columns = (_CELL_PX * np.indices((height, width)) + within)[:, by_cell.max(2) > _LEAST_CORNER]
     d_px = disparity_px[2 * rows, 2 * columns].astype(np.float64)
     # A pixel at half size covers two pixels in each direction.
     points = np.stack([2.0 * columns + 0.5, 2.0 * rows + 0.5, np.ones_like(d_px), d_px], 1)
@@ -78,7 +78,7 @@ def find_camera_motion(
     if len(corners.points) < _LEAST_CORNERS:
         return None
     before = match_brightness(corners.grey, grey)
-    there, found, _ = cv2.calcOpticalFlowPyrLK(
+    there, found, _ = cv2.calcOpticalFlowPyrLK(  # type: ignore[call-overload]
         before, grey, corners.places_px, None, winSize=(_WINDOW_PX,) * 2, maxLevel=_LEVELS, criteria=_STOP
     )
     kept = found[:, 0] > 0

@@ -82,8 +82,8 @@ def take_pixels(own, other, towards, before, after, share, weights, disparity_px
 def locate(motion, source, places):
     """Write the index of the pixel of another frame that each pixel shows to `places` [H, W].
 
-    It is the point of `source` (`splat_kernels.splat`) where the camera's motion explains the image, else where
-    optical flow leads.
+    It is the point of `source` (`splat_kernels.splat`) where the camera's motion explains the image, else
+    where optical flow leads.
     """
     to_before_px, explained, rests = motion.to_before_px, motion.explained, motion.rests
     height, width = places.shape

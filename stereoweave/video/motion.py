@@ -110,7 +110,7 @@ def measure_motion(
     before = match_brightness(before, grey)
     flow, least_levels, rests = _find_flow(before, grey)
     median_levels = min(float(np.median(least_levels[::4, ::4])), _NOISIEST_LEVELS)
-    allowed_levels = _EXPLAINED * median_levels + _LEAST_LEVELS
+    allowed_levels: float | Float[np.ndarray, "h2 w2"] = _EXPLAINED * median_levels + _LEAST_LEVELS
     if camera_path is None:
         explained = least_levels <= allowed_levels
         moves = ~(rests & explained)

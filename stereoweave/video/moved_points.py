@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from stereoweave.video.motion import CameraPath
-from stereoweave.video.splat_kernels import find_places, splat
+from stereoweave.video.splat_kernels import fill_cracks, find_places, splat
 from stereoweave.video.temporal_kernels import Track
 
 
@@ -38,6 +38,7 @@ def move_points(matrix: Float64[np.ndarray, "4 4"] | None, track: Track, right: 
     source, nearest_px = np.empty((height, width), np.int32), np.empty((height, width), np.float32)
     offset_px = np.empty((height, width, 2), np.float32)
     splat(matrix, float(right), track.disparity_px, track.offset_px, nearest_px, source, offset_px)
+    fill_cracks(nearest_px, source, offset_px)
     half = (height + 1) // 2, (width + 1) // 2
     path = CameraPath(np.empty((*half, 2), np.float32), np.empty(half, bool))
     find_places(source, track.offset_px, offset_px, path.to_before_px, path.known)

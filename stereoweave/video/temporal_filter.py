@@ -1,12 +1,14 @@
 """Temporal filter that averages the disparity of a video along its motion and restarts at each cut.
 
-Each view is filtered separately. The previous estimate is warped along the optical flow. A change in
-disparity that a pixel shares with its neighbourhood is treated as a true change in distance, and the rest as
-noise. Each pixel becomes the mean over the frames that saw its point.
+Each view is filtered separately. The previous estimate is warped to the new frame: where nothing but the
+camera moves, by its motion (`camera_motion`), elsewhere along the optical flow. A change in disparity that a
+pixel shares with its neighbourhood is treated as a true change in distance, and the rest as noise. Each pixel
+becomes the mean over the frames that saw its point.
 
 A pixel's mean restarts if the previous frame does not explain the image, or if the new disparity contradicts
-the old one. Near anything that moves in either view, one contradiction suffices; where everything is at rest,
-the majority of frames decides. Moving objects therefore leave no trail.
+the old one. Near anything that moves by itself in either view, one contradiction suffices, if it is not much
+less confident; elsewhere, frames that agree with each other must outvote the mean. Moving objects therefore
+leave no trail.
 """
 
 import typing
@@ -169,15 +171,8 @@ class TemporalFilter:
 def _begin_track(disparity_px: Float[np.ndarray, "h w"], confidence: Float[np.ndarray, "h w"]) -> Track:
     """Return the track of a view of the first frame."""
     weights = np.maximum(confidence, LEAST_WEIGHT).astype(np.float32)
-    nothing = np.zeros_like(weights)
-    return Track(
-        disparity_px,
-        confidence.astype(np.float32),
-        weights,
-        np.zeros((*weights.shape, 2), np.float32),
-        nothing,
-        nothing,
-    )
+    nothing, offset_px = np.zeros_like(weights), np.zeros((*weights.shape, 2), np.float32)
+    return Track(disparity_px, confidence.astype(np.float32), weights, offset_px, nothing, nothing)
 
 
 def _predict(
@@ -185,7 +180,8 @@ def _predict(
 ) -> Expectation:
     """Predict the new frame of a view from its track.
 
-    `view` is how the view moved; `towards` is the direction to the match in the other view: -1 for left, 1 for right.
+    `view` is how the view moved, and `towards` the direction to the match in the other view: -1 for left, 1
+    for right.
     """
     carried = Track(*(np.empty_like(values) for values in track))
     motion, moved = view

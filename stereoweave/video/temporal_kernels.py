@@ -4,12 +4,16 @@ import typing
 
 import numpy as np
 
-from stereoweave.system.jit import kernel
+from stereoweave.system.jit import inlined, kernel
 
 MOST_FRAMES = 12.0
 """Maximum number of frames in a mean. The limit lets the mean follow slow changes."""
 LEAST_WEIGHT = 0.1
+"""A frame counts as its confidence, but at least this much."""
 LEAST_RIVAL = 1.2
+"""A rival needs more than this to win, which takes two frames at least."""
+DOUBTED_SHARE = 0.5
+"""A frame less confident than this share of the mean is in doubt, whatever moves."""
 SAME_PX, SAME_SHARE = 1.0, 0.02
 """Frames show the same surface if their disparities differ by at most SAME_PX + SAME_SHARE * disparity."""
 NEIGHBOUR_PX = 3.0
@@ -24,11 +28,12 @@ class Track(typing.NamedTuple):
     Attributes:
         disparity_px: Mean disparity over the frames.
         confidence: Mean confidence; a frame that contradicts the mean counts as 0.
-        frames: Number of frames in the mean, minus the number that contradicted the mean afterwards; 0 where
-            the disparity is unknown.
+        frames: Number of frames in the mean, each weighted by its confidence; 0 where the disparity is
+            unknown.
         offset_px: float32 [H, W, 2], place of the point to the right of and below the pixel's centre.
         rival_px: Mean disparity over the frames that contradict the mean and agree with each other.
-        rival_frames: Number of these frames.
+        rival_frames: Weighted number of these frames, minus that of frames that contradicted them
+            afterwards; 0 if there is no rival.
     """
 
     disparity_px: np.ndarray
@@ -129,7 +134,11 @@ def measure_drift(new_px, carried, drift_px):
 @kernel
 @typing.no_type_check
 def blend(new, carried, calm, drift_px, mean):
-    """Combine `carried` with the new frame, and write the updated track to `mean`."""
+    """Combine `carried` with the new frame, and write the updated track to `mean`.
+
+    In calm areas, and where the new frame is in doubt, a frame that contradicts the mean counts for the
+    rival, which becomes the mean when more frames are for it. Elsewhere, such a frame starts a new mean.
+    """
     new_px, new_confidence = new.disparity_px, new.confidence
     old_px, old_confidence, old_frames = carried.disparity_px, carried.confidence, carried.frames
     disparity_px, confidence, frames = mean.disparity_px, mean.confidence, mean.frames
@@ -140,42 +149,48 @@ def blend(new, carried, calm, drift_px, mean):
     for y in range(height):
         for x in range(width):
             change_px = drift_px[y // 2, x // 2]
-            expected_px = old_px[y, x] + change_px
+            expected_px, rival = old_px[y, x] + change_px, old_rival_px[y, x] + change_px
+            count, rival_count = old_frames[y, x], old_rival_frames[y, x]
             same_px = SAME_PX + SAME_SHARE * abs(new_px[y, x])
             apart_px = new_px[y, x] - expected_px
             weight = max(new_confidence[y, x], LEAST_WEIGHT)
-            count = old_frames[y, x]
-            rival = old_rival_px[y, x] + change_px
-            rival_count = old_rival_frames[y, x]
-            offset_px[y, x, 0], offset_px[y, x, 1] = old_offset_px[y, x, 0], old_offset_px[y, x, 1]
-            if count > 0 and abs(apart_px) > same_px:
-                if calm[y // 2, x // 2] or weight < 0.5 * old_confidence[y, x]:
-                    if rival_count > 0 and abs(new_px[y, x] - rival) <= same_px:
-                        rival_count += weight
-                        rival += weight / rival_count * (new_px[y, x] - rival)
-                    else:
-                        rival_count -= weight
-                        if rival_count <= 0:
-                            rival_count, rival = weight, new_px[y, x]
-                    lost = rival_count > max(count, LEAST_RIVAL)
-                    disparity_px[y, x] = rival if lost else expected_px
-                    frames[y, x] = rival_count if lost else count
-                    confidence[y, x] = (
-                        new_confidence[y, x] if lost else old_confidence[y, x] * count / (count + weight)
-                    )
-                    rival_px[y, x] = expected_px if lost else rival
-                    rival_frames[y, x] = count if lost else rival_count
-                    if lost:
-                        offset_px[y, x, 0] = offset_px[y, x, 1] = 0.0
-                    continue
-                count = 0.0
-            if count == 0.0:
-                offset_px[y, x, 0] = offset_px[y, x, 1] = 0.0
-            rival_px[y, x], rival_frames[y, x] = rival, max(rival_count - 0.5 * weight, 0.0)
-            if count == 0.0:
-                rival_frames[y, x] = 0.0
-            count = min(count + weight, MOST_FRAMES)
-            share = weight / count
-            disparity_px[y, x] = new_px[y, x] - (1.0 - share) * apart_px
-            confidence[y, x] = old_confidence[y, x] + share * (new_confidence[y, x] - old_confidence[y, x])
-            frames[y, x] = count
+            contradicts = count > 0 and abs(apart_px) > same_px
+            doubted = calm[y // 2, x // 2] or weight < DOUBTED_SHARE * old_confidence[y, x]
+            moved = 0.0
+            if contradicts and doubted:
+                rival, rival_count = _count_rival(new_px[y, x], weight, same_px, rival, rival_count)
+                moved = 1.0
+                disparity_px[y, x], frames[y, x] = expected_px, count
+                confidence[y, x] = old_confidence[y, x] * count / (count + weight)
+                rival_px[y, x], rival_frames[y, x] = rival, rival_count
+                if rival_count > max(count, LEAST_RIVAL):
+                    moved = 0.0
+                    disparity_px[y, x], frames[y, x] = rival, rival_count
+                    confidence[y, x] = new_confidence[y, x]
+                    rival_px[y, x], rival_frames[y, x] = expected_px, count
+            else:
+                if contradicts or count == 0:
+                    count = rival_count = 0.0
+                else:
+                    moved = 1.0
+                rival_px[y, x], rival_frames[y, x] = rival, max(rival_count - 0.5 * weight, 0.0)
+                count = min(count + weight, MOST_FRAMES)
+                share = weight / count
+                disparity_px[y, x] = new_px[y, x] - (1.0 - share) * apart_px
+                more = new_confidence[y, x] - old_confidence[y, x]
+                confidence[y, x] = old_confidence[y, x] + share * more
+                frames[y, x] = count
+            # A new mean is of points at the pixels' centres.
+            offset_px[y, x, 0] = moved * old_offset_px[y, x, 0]
+            offset_px[y, x, 1] = moved * old_offset_px[y, x, 1]
+
+
+@inlined
+@typing.no_type_check
+def _count_rival(new_px, weight, same_px, rival_px, count):
+    """Return the rival's disparity and frames after a frame that contradicts the mean."""
+    if count > 0 and abs(new_px - rival_px) <= same_px:
+        return rival_px + weight / (count + weight) * (new_px - rival_px), count + weight
+    if count > weight:
+        return rival_px, count - weight
+    return new_px, weight

@@ -19,6 +19,7 @@ from stereoweave.bench.flicker_videos import (
     RenderedVideo,
     add_noise,
     add_passing_oval,
+    expose,
     freeze,
     render_panning,
     reproject,
@@ -208,6 +209,15 @@ def test_an_oval_that_comes_nearer_moves_less_to_the_right_in_the_middle_view(th
     assert change_px.max() == 0.5
 
 
+def test_exposures_change_pictures_and_not_their_truth(three_frames):
+    video = expose(three_frames, "fade", [1.0, 0.5, 1.5])
+    first, second, third = (pair.left.astype(float) for pair in video.pairs)
+    np.testing.assert_array_equal(first, three_frames.pairs[0].left)
+    assert np.abs(second - 0.5 * first).max() <= 0.5
+    np.testing.assert_array_equal(third[first > 170], 255)
+    assert video.name == "fade" and video.disparities_px is three_frames.disparities_px
+
+
 @pytest.mark.needs_egl
 def test_a_rendered_pan_looks_the_same_along_its_true_motion():
     video = render_panning(RenderSpec(scene="ship", seed=4, size_px=(160, 120), frames=12), 2)
@@ -224,8 +234,8 @@ def test_a_rendered_pan_looks_the_same_along_its_true_motion():
 @pytest.mark.needs_egl
 def test_the_rows_show_the_effect_of_the_temporal_filter():
     rows = list(score_flicker(["rooms"], frames=4, size_px=(160, 120), seed=3, threads=1))
-    assert [row.film for row in rows[::3]] == ["still", "passing", "nearing", "panning"]
-    assert [row.method for row in rows] == [FRAME_BY_FRAME, STEADY, CARRIED] * 4
+    assert [row.film for row in rows[::3]] == ["still", "passing", "nearing", "panning", "flash", "fade"]
+    assert [row.method for row in rows] == [FRAME_BY_FRAME, STEADY, CARRIED] * 6
     for by_frame, steady, carried in zip(rows[::3], rows[1::3], rows[2::3], strict=True):
         assert carried.flicker_px < steady.flicker_px < by_frame.flicker_px
         assert max(carried.jumps_share, steady.jumps_share) < by_frame.jumps_share

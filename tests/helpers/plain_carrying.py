@@ -1,4 +1,4 @@
-"""Plain version of the kernel that takes each pixel of a frame from one of two other frames."""
+"""Plain versions of the kernels that take each pixel of a frame from one of two other frames."""
 
 import numpy as np
 
@@ -27,9 +27,8 @@ def plain_take(own, other, towards, sources, share, weights):
         here = _window(own, y, x)
         weight = weights[np.abs(here - own[y, x]).astype(int)]
         values, apart = [], []
-        for grey, disparity_px, confidence, to_source_px in sources:
-            column, row = (np.array([x, y]) + np.rint(to_source_px[y // 2, x // 2])).astype(int)
-            row, column = np.clip(row, 0, own.shape[0] - 1), np.clip(column, 0, own.shape[1] - 1)
+        for grey, disparity_px, confidence, places in sources:
+            row, column = divmod(int(places[y, x]), own.shape[1])
             values.append(np.array([disparity_px[row, column], confidence[row, column]], float))
             shown = [_window(grey, row, column), _matched_window(other, y, x + towards * values[-1][0])]
             apart.append(sum((weight * np.minimum(np.abs(here - each), MOST_LEVELS)).sum() for each in shown))
@@ -39,3 +38,14 @@ def plain_take(own, other, towards, sources, share, weights):
             part = 0.0 if apart[0] <= apart[1] else 1.0
         found[:, y, x] = values[0] + part * (values[1] - values[0])
     return found
+
+
+def plain_locate(flow_px, follows, source):
+    """Return the index of the pixel of another frame that each pixel shows; see `carried_kernels.locate`."""
+    places = source.copy()
+    height, width = source.shape
+    for y, x in np.ndindex(source.shape):
+        if source[y, x] < 0 or not follows[y // 2, x // 2]:
+            column, row = (np.array([x, y]) + np.rint(flow_px[y // 2, x // 2])).astype(int)
+            places[y, x] = np.clip(row, 0, height - 1) * width + np.clip(column, 0, width - 1)
+    return places

@@ -3,11 +3,12 @@
 import cv2
 import numpy as np
 import pytest
-from plain_carrying import plain_take
+from plain_carrying import plain_locate, plain_take
 
 from stereoweave.stereo import Estimate, StereoPair
 from stereoweave.video.carried_frames import WEIGHTS, carry_between
-from stereoweave.video.carried_kernels import Source, take_pixels
+from stereoweave.video.carried_kernels import Source, locate, take_pixels
+from stereoweave.video.motion import Motion
 from stereoweave.video.temporal_filter import TemporalFilter
 
 HEIGHT, WIDTH = 120, 176
@@ -100,14 +101,12 @@ def test_nothing_lies_between_neighbours(rng):
 @pytest.mark.parametrize("towards", [-1, 1])
 def test_the_kernel_equals_its_plain_version(rng, shape, towards):
     own, other, *greys = (rng.integers(0, 256, shape).astype(np.uint8) for _ in range(4))
-    half = (shape[0] + 1) // 2, (shape[1] + 1) // 2
     sources = [
         Source(
             grey,
             rng.choice([5.0, 5.4, 7.3, 12.0], shape).astype(np.float32),
             rng.uniform(0, 1, shape).astype(np.float32),
-            # Exact halves are excluded, because NumPy and the kernel may round them differently.
-            (rng.integers(-4, 5, (*half, 2)) + rng.uniform(-0.4, 0.4, (*half, 2))).astype(np.float32),
+            rng.integers(0, shape[0] * shape[1], shape).astype(np.int32),
         )
         for grey in greys
     ]
@@ -115,3 +114,15 @@ def test_the_kernel_equals_its_plain_version(rng, shape, towards):
     take_pixels(own, other, towards, *sources, 0.3, WEIGHTS, *found)
     expected = plain_take(own, other, towards, sources, 0.3, WEIGHTS)
     np.testing.assert_allclose(found, expected, atol=1e-4)
+
+
+@pytest.mark.parametrize("shape", [(20, 26), (21, 17)])
+def test_pixels_are_looked_up_along_the_camera_s_motion_or_else_along_flow(rng, shape):
+    half = (shape[0] + 1) // 2, (shape[1] + 1) // 2
+    # Exact halves are excluded, because NumPy and the kernel may round them differently.
+    flow_px = (rng.integers(-4, 5, (*half, 2)) + rng.uniform(-0.4, 0.4, (*half, 2))).astype(np.float32)
+    explained, calm, rests = (rng.random(half) < 0.7 for _ in range(3))
+    source = rng.integers(-1, shape[0] * shape[1], shape).astype(np.int32)
+    places = np.empty(shape, np.int32)
+    locate(Motion(flow_px, explained, calm, 1.0, rests), source, places)
+    np.testing.assert_array_equal(places, plain_locate(flow_px, explained & rests, source))

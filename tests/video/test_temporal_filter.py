@@ -11,6 +11,9 @@ from stereoweave.stereo import Estimate
 from stereoweave.video.motion import Motion
 from stereoweave.video.temporal_filter import TemporalFilter
 from stereoweave.video.temporal_kernels import (
+    DOUBTED_SHARE,
+    LEAST_RIVAL,
+    LEAST_WEIGHT,
     MOST_FRAMES,
     NEIGHBOUR_PX,
     SAME_PX,
@@ -118,8 +121,23 @@ def test_at_rest_a_contradiction_is_outvoted_until_it_has_lasted_equally_long(rn
 def test_a_contradiction_lowers_the_confidence(rng):
     video = at_rest(rng, [plain(10), plain(10, 40), plain(10)])
     found = [each.confidence[PIXEL] for each in filter_all(video)[0]]
-    # The contradiction halves the confidence and cancels the first frame: the third starts a new mean.
-    np.testing.assert_allclose(found, [0.8, 0.4, 0.8], atol=1e-6)
+    # The contradiction counts as 0 beside one frame of 0.8; then follows the mean of 0.4 and 0.8.
+    np.testing.assert_allclose(found, [0.8, 0.4, 0.6], atol=1e-6)
+
+
+def test_disparities_that_contradict_each_other_do_not_outvote_the_mean(rng):
+    values_px = [10, 40, 20, 60, 30, 50, 80]
+    found = disparities(filter_all(at_rest(rng, [plain(10, px) for px in values_px]))[0])
+    np.testing.assert_allclose(found[:, *PIXEL], 10, atol=1e-5)
+
+
+def test_a_confident_rival_outvotes_a_doubtful_mean_after_two_frames(rng):
+    video = at_rest(rng, [plain(10) for _ in range(5)] + [plain(10, 40) for _ in range(3)])
+    for *_, each in video[:5]:
+        each.confidence[PIXEL] = 0.1
+    found = disparities(filter_all(video)[0])
+    # The mean counts 5 * 0.1 frames, the rival 0.8, then 1.6, which is above 0.5 and above LEAST_RIVAL.
+    np.testing.assert_allclose(found[4:, *PIXEL], [10, 10, 40, 40], atol=1e-5)
 
 
 def test_flicker_of_a_still_video_at_least_halves_in_both_views(rng):
@@ -345,7 +363,10 @@ def random_track(rng, shape):
     return Track(
         rng.choice([5.0, 5.4, 7.0, 30.0], shape).astype(np.float32),
         rng.uniform(0, 1, shape).astype(np.float32),
-        rng.integers(0, 14, shape).astype(np.float32),
+        rng.choice([0.0, 0.4, 1.3, 6.0, 11.8], shape).astype(np.float32),
+        rng.uniform(-0.5, 0.5, (*shape, 2)).astype(np.float32),
+        rng.choice([5.2, 7.3, 29.8], shape).astype(np.float32),
+        rng.choice([0.0, 0.2, 0.9, 3.0], shape).astype(np.float32),
     )
 
 
@@ -353,30 +374,45 @@ def random_motion(rng, shape):
     half = ((shape[0] + 1) // 2, (shape[1] + 1) // 2)
     # Exact halves are excluded, because NumPy and the kernel may round them differently.
     to_before_px = rng.integers(-5, 6, (*half, 2)) + rng.uniform(-0.4, 0.4, (*half, 2))
-    return Motion(to_before_px.astype(np.float32), rng.random(half) < 0.8, rng.random(half) < 0.5, 1.0)
+    explained, calm, rests = (rng.random(half) < share for share in (0.8, 0.5, 0.6))
+    return Motion(to_before_px.astype(np.float32), explained, calm, 1.0, rests)
 
 
 def empty_track(shape):
-    return Track(*(np.full(shape, np.nan, np.float32) for _ in range(3)))
+    return Track(*(np.full(each.shape, np.nan, np.float32) for each in begin_track(np.zeros(shape))))
 
 
-def plain_carry(new_px, track, motion):
-    carried = Track(*(np.zeros(new_px.shape, np.float32) for _ in range(3)))
+def begin_track(disparity_px):
+    """Return the track of a disparity map that is all that is known, with no frames."""
+    nothing = np.zeros(disparity_px.shape, np.float32)
+    confidence, frames, rival_px, rival_frames = nothing[None].repeat(4, 0)
+    offset_px = np.zeros((*nothing.shape, 2), np.float32)
+    return Track(nothing, confidence, frames, offset_px, rival_px, rival_frames)
+
+
+def plain_carry(new_px, track, motion, source, source_offset_px):
+    carried = begin_track(new_px)
     height, width = new_px.shape
     for y, x in np.ndindex(new_px.shape):
         half = y // 2, x // 2
+        if source[y, x] >= 0 and motion.rests[half] and motion.explained[half]:
+            for to, values in zip(carried, track, strict=True):
+                to[y, x] = values[divmod(source[y, x], width)]
+            carried.offset_px[y, x] = source_offset_px[y, x]
+            continue
         column, row = (np.array([x, y]) + np.rint(motion.to_before_px[half])).astype(int)
         if not motion.explained[half] or not (0 <= row < height and 0 <= column < width):
             continue
-        source = row, column
+        place = row, column
         if not motion.calm[half]:
             around = [(row + j, column + i) for j in (-1, 0, 1) for i in (-1, 0, 1)]
-            around = [place for place in around if 0 <= place[0] < height and 0 <= place[1] < width]
-            apart_px = [abs(track.disparity_px[place] - new_px[y, x]) for place in around]
-            if min(apart_px) < abs(track.disparity_px[source] - new_px[y, x]) - 0.5:
-                source = around[int(np.argmin(apart_px))]
+            around = [each for each in around if 0 <= each[0] < height and 0 <= each[1] < width]
+            apart_px = [abs(track.disparity_px[each] - new_px[y, x]) for each in around]
+            if min(apart_px) < abs(track.disparity_px[place] - new_px[y, x]) - 0.5:
+                place = around[int(np.argmin(apart_px))]
         for to, values in zip(carried, track, strict=True):
-            to[y, x] = values[source]
+            to[y, x] = values[place]
+        carried.offset_px[y, x] = 0
     return carried
 
 
@@ -399,28 +435,47 @@ def plain_drift(new_px, carried, shape):
 
 
 def plain_blend(new, carried, calm, drift_px):
-    full = tuple(np.s_[:side] for side in new.frames.shape)
-    calm, drift_px = (values.repeat(2, 0).repeat(2, 1)[full] for values in (calm, drift_px))
-    expected_px = carried.disparity_px + drift_px
-    apart_px = new.disparity_px - expected_px
-    known = carried.frames >= 1
-    contradicted = known & (np.abs(apart_px) > SAME_PX + SAME_SHARE * np.abs(new.disparity_px))
-    kept = contradicted & calm
-    frames = np.minimum(np.where(known & ~contradicted, carried.frames, 0) + 1, MOST_FRAMES)
-    claim = carried.confidence + (new.confidence - carried.confidence) / frames
-    return Track(
-        np.where(kept, expected_px, expected_px + apart_px / frames),
-        np.where(kept, carried.confidence * carried.frames / (carried.frames + 1), claim),
-        np.where(kept, carried.frames - 1, frames),
-    )
+    mean = begin_track(new.frames)
+    for at in np.ndindex(new.frames.shape):
+        half = at[0] // 2, at[1] // 2
+        found_px, old_confidence, count, offset_px, rival_px, rival = (values[at] for values in carried)
+        found_px, rival_px = found_px + drift_px[half], rival_px + drift_px[half]
+        new_px, confidence = new.disparity_px[at], new.confidence[at]
+        weight, same_px = max(confidence, LEAST_WEIGHT), SAME_PX + SAME_SHARE * abs(new_px)
+        if count == 0 or abs(new_px - found_px) <= same_px:
+            before = count
+            count = min(count + weight, MOST_FRAMES)
+            share, rival = weight / count, max(rival - weight / 2, 0) if before else 0
+            found_px, confidence = (
+                (1 - share) * found_px + share * new_px,
+                ((1 - share) * old_confidence + share * confidence),
+            )
+            offset_px = offset_px * (before > 0)
+        elif calm[half] or weight < DOUBTED_SHARE * old_confidence:
+            if rival > 0 and abs(new_px - rival_px) <= same_px:
+                rival_px, rival = (rival * rival_px + weight * new_px) / (rival + weight), rival + weight
+            else:
+                rival_px, rival = (rival_px, rival - weight) if rival > weight else (new_px, weight)
+            if rival > max(count, LEAST_RIVAL):
+                found_px, count, rival_px, rival, offset_px = rival_px, rival, found_px, count, 0
+            else:
+                confidence = old_confidence * count / (count + weight)
+        else:
+            found_px, count, rival, offset_px = new_px, weight, 0, 0
+        for to, value in zip(mean, (found_px, confidence, count, offset_px, rival_px, rival), strict=True):
+            to[at] = value
+    return mean
 
 
 @pytest.mark.parametrize("shape", [(40, 50), (41, 33)])
 def test_the_kernels_equal_their_plain_versions(rng, shape):
     track, new, motion = random_track(rng, shape), random_track(rng, shape), random_motion(rng, shape)
     carried = empty_track(shape)
-    carry(new.disparity_px, track, motion, carried)
-    for found, expected in zip(carried, plain_carry(new.disparity_px, track, motion), strict=True):
+    source = rng.integers(-1, shape[0] * shape[1], shape).astype(np.int32)
+    source_offset_px = rng.uniform(-0.5, 0.5, (*shape, 2)).astype(np.float32)
+    carry(new.disparity_px, track, motion, source, source_offset_px, carried)
+    plain_carried = plain_carry(new.disparity_px, track, motion, source, source_offset_px)
+    for found, expected in zip(carried, plain_carried, strict=True):
         np.testing.assert_array_equal(found, expected)
     drift_px = np.full(motion.calm.shape, np.nan, np.float32)
     measure_drift(new.disparity_px, carried, drift_px)

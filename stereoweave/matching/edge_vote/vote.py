@@ -90,7 +90,7 @@ def _vote(
     unsound: Bool[np.ndarray, "h w"],
     threads: int | None,
 ) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
-    """Return the disparities and confidences after all rounds; `unsound` becomes the pixels without a vote."""
+    """Return the disparities and confidences after all rounds; `unsound` keeps the pixels without a vote."""
     from stereoweave.matching.edge_vote.vote_kernels import vote  # it loads LLVM
 
     lab = cv2.cvtColor(image.astype(np.float32) / 255, cv2.COLOR_RGB2LAB)
