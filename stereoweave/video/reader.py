@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import UInt8
 
 from stereoweave.cameras.sphere_remap import Cutter
-from stereoweave.cameras.spherical import FISHEYE, RECTILINEAR, SphereRequest
+from stereoweave.cameras.spherical import SphereRequest
 from stereoweave.errors import FormatError, Note, Remedy, StereoweaveError
 from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS, detect_layout
-from stereoweave.pictures.panoramas import SphereView, guess_projection
+from stereoweave.pictures.panoramas import SphereView, choose_layout, guess_projection
 from stereoweave.video.tracks import Shot, Track, VideoTrack, open_track
 
 # A spatial video is refused if none of this many images is followed by its second view.
@@ -214,9 +214,9 @@ def _combine(tracks: Sequence[Track], format: str | None, sphere: SphereRequest)
         _check_second_view(track)
         return StereoVideo(tracks, None)
     name = format or detect_layout(track.name, track.samples(), track.declared_packing)
-    if track.sphere or sphere.projection not in (None, RECTILINEAR, FISHEYE):
-        # Angles are shares of width and height, whatever their ratio: enlarging would add no detail.
-        name = name.removesuffix("_half")
+    if not format or sphere.projection is not None:
+        named = None if track.sphere else track.name
+        name = choose_layout(name, named, track.size_px, sphere)
     try:
         return StereoVideo(tracks, name)
     except FormatError as error:
