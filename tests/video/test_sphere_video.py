@@ -140,9 +140,8 @@ def test_the_maps_of_a_film_are_computed_once(tmp_path, half_scene, monkeypatch)
 )
 def test_the_whole_of_a_film_becomes_vr180_again(tmp_path, half_scene, layout, packing):
     # Chroma of half resolution loses fine colours, whatever else is done.
-    smooth = half_scene._replace(
-        **{eye: cv2.GaussianBlur(getattr(half_scene, eye), (0, 0), 3) for eye in EYES}
-    )
+    left, right = (cv2.GaussianBlur(eye, (0, 0), 3) for eye in (half_scene.left, half_scene.right))
+    smooth = half_scene._replace(left=left, right=right)
     film = write_film(tmp_path / "a.mp4", smooth, marks=VR180 | {"baseline_m": 0.063})
     assert run("video", film, "--whole", "--layout", layout, "-o", tmp_path / "b.mp4") == 0
     [out] = tmp_path.glob("b*.mp4")
