@@ -76,7 +76,8 @@ ERRORS = {
     "position: expected -1 to 2 (0 is the left camera and 1 the right one), got 3": (
         lambda: sw.synthesize(BLACK, BLACK, 3, threads=1)
     ),
-    "expected one kind of output, found none; choose one (depth, depth16, position, layout)": VideoJob,
+    "expected one kind of output, found none; choose one (depth, depth10, depth16, position, "
+    "layout)": VideoJob,
     "gpus_each: expected 0, a fraction below 1, or a whole number, found 1.5": lambda: Engine(gpus_each=1.5),
 }
 

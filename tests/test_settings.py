@@ -30,7 +30,7 @@ VARIABLE: dict[tuple[str, str], set[str]] = {
     ("stereo.py", "name"): {"focal_px", "baseline_m"},
     ("synth/sets/make.py", "name"): {"pairs", "seed", "frames"},
     ("video/job.py", "setting"): {"strength", "convergence_px"},
-    ("video/job.py", "tuple(kinds)"): {"depth", "depth16", "position", "layout"},
+    ("video/job.py", "tuple(kinds)"): {"depth", "depth10", "depth16", "position", "layout"},
 }
 # Subpackages whose errors reach the page and the service.
 SHARED = {"cameras", "matching", "outputs", "pictures", "rendering"}

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Num
 
 from stereoweave.cameras.row_field import RowField
 
@@ -49,8 +49,8 @@ class PictureWarp:
         return replace(self, homography=about_centre @ self.homography)
 
     def apply(
-        self, image: UInt8[np.ndarray, "h w 3"], seen: Bool[np.ndarray, "h w"] | None
-    ) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
+        self, image: Num[np.ndarray, "h w 3"], seen: Bool[np.ndarray, "h w"] | None
+    ) -> tuple[Num[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
         """Warp a picture, repeating its border; return it with the mask of its valid pixels."""
         x_px, y_px = self._find_sources()
         before = np.full(image.shape[:2], 255, np.uint8) if seen is None else 255 * seen.astype(np.uint8)

@@ -53,6 +53,13 @@ Depth = Annotated[
         "--depth", help="Write the left view's disparity in colour, with one range for the whole video."
     ),
 ]
+Depth10 = Annotated[
+    bool,
+    typer.Option(
+        "--depth10",
+        help="Write the left view's disparity as 10-bit grey (HEVC), linear over the whole video's range.",
+    ),
+]
 Depth16 = Annotated[
     bool,
     typer.Option(
@@ -68,6 +75,14 @@ Position = Annotated[
 Layout = Annotated[
     str | None,
     typer.Option(help="Write a layout of `stereoweave view`, such as anaglyph_dubois or quilt."),
+]
+Bits = Annotated[
+    int,
+    typer.Option(
+        metavar="8|10",
+        help="Bits of each colour of a view or a layout: 8 (H.264), or 10 (HEVC), which keeps HDR in views, "
+        "and in layouts with one view for each eye.",
+    ),
 ]
 Convergence = Annotated[
     float | None,
@@ -122,9 +137,11 @@ def video(  # noqa: PLR0913 - each is an option of the command line
     videos: Videos,
     out: Out,
     depth: Depth = False,
+    depth10: Depth10 = False,
     depth16: Depth16 = False,
     position: Position = None,
     layout: Layout = None,
+    bits: Bits = 8,
     strength: Strength = 1.0,
     convergence: Convergence = None,
     format: Format = None,
@@ -158,9 +175,11 @@ def video(  # noqa: PLR0913 - each is an option of the command line
     try:
         job = VideoJob(
             depth=depth,
+            depth10=depth10,
             depth16=depth16,
             position=position,
             layout=layout,
+            bits=bits,
             strength=strength,
             convergence_px=convergence,
             rectify=rectify,

@@ -44,8 +44,8 @@ Out = Annotated[
         "-o",
         help="File to write (default: in the current folder, named after the left picture and the layout, "
         "such as left_view.png or left_wiggle.webp). Viewers recognise some layouts by a mark in the file "
-        "name, which is added automatically: view.png becomes view_qs8x6a0.75.png for a quilt. .mpo and .jps "
-        "are 3-D pictures, .html is a 3-D photo (--layout viewer).",
+        "name, which is added automatically: view.png becomes view_qs8x6a0.75.png for a quilt. .mpo, .jps "
+        "and .heic (a spatial photo) are 3-D pictures, .html is a 3-D photo (--layout viewer).",
     ),
 ]
 Position = Annotated[

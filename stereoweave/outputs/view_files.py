@@ -27,7 +27,7 @@ from stereoweave.rendering.layouts import (
 from stereoweave.rendering.rehearsals import rehearse_drawing, rehearse_filling, rehearse_moving
 from stereoweave.rendering.renderer import Renderer, check_position
 from stereoweave.rendering.scaling import fit_size, scale_down
-from stereoweave.stereo import Estimate, StereoPair
+from stereoweave.stereo import Estimate, StereoCamera, StereoPair
 from stereoweave.system.compiling_ahead import Rehearsal
 from stereoweave.system.steps import step
 
@@ -146,7 +146,7 @@ class ViewFile:
         part = self._find_part(renderer)
         if name in LAYOUTS:
             image = _cut(LAYOUTS[name].compose(renderer, self.layout_options), part)
-            write_picture(self.path, image)
+            write_picture(self.path, image, _find_camera(renderer))
             return WrittenView(f"{name}, {image.shape[1]}x{image.shape[0]} px", image)
         motion = ANIMATIONS[name]
         turns = motion.turns(self.path)
@@ -171,6 +171,14 @@ class ViewFile:
         )
         write_viewer(self.path, page)
         return WrittenView(f"{VIEWER}, {len(page) / 1e6:.2g} MB; open it in a browser")
+
+
+def _find_camera(renderer: Renderer) -> StereoCamera | None:
+    """Return the camera of the eyes' views; None if it is unknown, or if the views are shifted."""
+    camera = renderer.pair.camera
+    if camera is None or camera.doffs_px or renderer.convergence_px or not renderer.strength:
+        return None
+    return replace(camera, baseline_m=renderer.strength * camera.baseline_m)
 
 
 def can_crop(name: str | None) -> bool:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32, Num, UInt8
 
 from stereoweave.errors import FormatError, Note, Remedy
 from stereoweave.io.images import SMALLEST_SIDE_PX
@@ -41,7 +41,9 @@ class PairLayout(NamedTuple):
             return (even_px, height_px) if self.beside else (width_px, even_px)
         return (width_px // 2, height_px) if self.beside else (width_px, height_px // 2)
 
-    def eyes(self, frame: Frame) -> tuple[Picture, Picture]:
+    def eyes(
+        self, frame: Num[np.ndarray, "rows columns 3"]
+    ) -> tuple[Num[np.ndarray, "h w 3"], Num[np.ndarray, "h w 3"]]:
         """Return the left and the right view of a frame, each at full size.
 
         Of a frame of odd width (or height), the last column (or row) is dropped.

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Num, UInt8
 from PIL import Image
 
 from stereoweave.errors import Remedy, StereoweaveError
@@ -20,8 +20,9 @@ from stereoweave.io.animation import check_animation_ending
 from stereoweave.io.colormap import find_colour_range_px
 from stereoweave.io.files import replacing
 from stereoweave.io.images import checking_format_size, picture_kind, write_image
+from stereoweave.io.spatial_photos import write_spatial_photo
 from stereoweave.rendering.renderer import Renderer, check_position
-from stereoweave.stereo import Estimate, StereoPair
+from stereoweave.stereo import Estimate, StereoCamera, StereoPair
 
 # Viewers of a quilt move their heads much farther than the cameras are apart, so a quilt needs a wide range
 # of positions. The outer views may consist mostly of filled holes, but are seen least.
@@ -241,7 +242,7 @@ ANIMATIONS: dict[str, Animation] = {
 VIEWER = "viewer"
 """The layout of a page that shows the scene in 3-D (`outputs/viewer.py`)."""
 # Layouts that are determined by the file extension.
-_LAYOUT_BY_ENDING = {".mpo": "side_by_side", ".jps": "crossed", ".html": VIEWER}
+_LAYOUT_BY_ENDING = {".mpo": "side_by_side", ".heic": "side_by_side", ".jps": "crossed", ".html": VIEWER}
 # No chroma subsampling, because stereo pictures are magnified and compared by both eyes.
 _FINE = {"quality": 95, "subsampling": 0}
 # The JPEG marker APP3, the segment's length, the identifier, the length of the next four bytes, these four
@@ -305,7 +306,7 @@ def add_mark(path: str | Path, name: str, pair: StereoPair, choices: LayoutOptio
     """Return a path whose file name ends in the suffix by which viewers detect the layout.
 
     A quilt's suffix gives the numbers of columns and rows and the aspect ratio of one view, as in
-    view_qs8x6a0.75.png. An .mpo or .jps file needs no suffix.
+    view_qs8x6a0.75.png. An .mpo, .heic or .jps file needs no suffix.
     """
     path = Path(path)
     if path.suffix.lower() in _LAYOUT_BY_ENDING:
@@ -316,22 +317,29 @@ def add_mark(path: str | Path, name: str, pair: StereoPair, choices: LayoutOptio
     return path if path.stem.endswith(mark) else path.with_stem(path.stem + mark)
 
 
-def write_picture(path: str | Path, picture: UInt8[np.ndarray, "h w 3"]) -> None:
+def write_picture(
+    path: str | Path, picture: UInt8[np.ndarray, "h w 3"], camera: StereoCamera | None = None
+) -> None:
     """Write a layout's image in the format given by the file extension.
 
     An .mpo file, the format of 3-D cameras, stores the two halves of a `side_by_side` image as separate
-    pictures, with the left eye's first. A .jps file is a JPEG of a `crossed` image with a JPS header.
+    pictures, with the left eye's first. So does a .heic file, a spatial photo, with their `camera`. A .jps
+    file is a JPEG of a `crossed` image with a JPS header.
     """
     ending = Path(path).suffix.lower()
     if ending not in _LAYOUT_BY_ENDING:
         write_image(path, picture)
         return
+    if ending == ".heic":
+        left, right = np.split(picture, 2, axis=1)
+        write_spatial_photo(Path(path), left, right, camera)
+        return
     with replacing(path) as temporary, checking_format_size(path, picture.shape):
         if ending == ".jps":
             Image.fromarray(picture).save(temporary, "JPEG", extra=_JPS_SEGMENT, **_FINE)
         else:
-            left, right = (Image.fromarray(half) for half in np.split(picture, 2, axis=1))
-            left.save(temporary, "MPO", save_all=True, append_images=[right], **_FINE)
+            first, second = (Image.fromarray(half) for half in np.split(picture, 2, axis=1))
+            first.save(temporary, "MPO", save_all=True, append_images=[second], **_FINE)
 
 
 def _render_eyes(renderer: Renderer) -> list[UInt8[np.ndarray, "h w 3"]]:
@@ -339,7 +347,7 @@ def _render_eyes(renderer: Renderer) -> list[UInt8[np.ndarray, "h w 3"]]:
     return list(render_views(renderer, (0.0, 1.0)))
 
 
-def squeeze(eye: UInt8[np.ndarray, "h w 3"], axis: int) -> UInt8[np.ndarray, "h2 w2 3"]:
+def squeeze(eye: Num[np.ndarray, "h w 3"], axis: int) -> Num[np.ndarray, "h2 w2 3"]:
     """Squeeze an image to half its size along an axis by averaging neighbouring pixels.
 
     If the side along this axis is odd, the last row or column is repeated.

@@ -28,12 +28,20 @@ def rehearse_filling() -> None:
     fill(canvas)
 
 
+def rehearse_fine_drawing() -> None:
+    """Render a small view in more than 8 bits, and fill its holes, from between and beyond the cameras."""
+    renderer = _renderer(fine=True)
+    for position in (0.5, 1.5):
+        renderer.fine_view(position)
+
+
 def rehearse_moving() -> None:
     """Render a small view from above the line through the cameras."""
     _renderer().view(0.5, up=0.5)
 
 
-def _renderer() -> Renderer:
+def _renderer(*, fine: bool = False) -> Renderer:
     image, px = np.zeros((_SIDE_PX, _SIDE_PX, 3), np.uint8), np.zeros((_SIDE_PX, _SIDE_PX), np.float32)
     estimate = Estimate(disparity_px=px, right_disparity_px=px, confidence=px, occluded=px > 0)
-    return Renderer(StereoPair(left=image, right=image), estimate, threads=1)
+    pictures = (image.astype(np.float32),) * 2 if fine else None
+    return Renderer(StereoPair(left=image, right=image), estimate, threads=1, fine=pictures)

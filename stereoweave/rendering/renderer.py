@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Float32, Num, UInt8
 
 from stereoweave.arguments import check_kind, check_number
 from stereoweave.errors import StereoweaveError
@@ -40,9 +40,11 @@ class Renderer:
         strength: Factor that scales the baseline about its middle: position p is seen from
             0.5 + strength * (p - 0.5).
         convergence_px: Disparity of the plane that stays in place in all views; from -width to width.
+        fine: The two images in more than 8 bits, for `fine_view`: float32 RGB from 0 to 255, of which the
+            pair's are the rounded ones; None if there are none.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - the options of all views
         self,
         pair: StereoPair,
         estimate: Estimate,
@@ -50,16 +52,18 @@ class Renderer:
         strength: float = 1.0,
         convergence_px: float = 0.0,
         threads: int | None = None,
+        fine: tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w 3"]] | None = None,
     ) -> None:
         check_fits(estimate, pair)
         _check_shifts(strength, convergence_px, pair)
+        _check_fine(fine, pair)
         self.pair, self.estimate = pair, estimate
-        self.strength, self.convergence_px = strength, convergence_px
+        self.strength, self.convergence_px, self.fine = strength, convergence_px, fine
         self._threads = min(_MOST_THREADS, thread_count(threads))
         maps_px = estimate.disparity_px, estimate.right_disparity_px
         with ThreadPoolExecutor(self._threads) as pool:
             looks = pool.submit(match_exposure, pair.left, pair.right, estimate)
-            self._sides = tuple(pool.map(_make_side, (pair.left, pair.right), maps_px))
+            self._sides = tuple(pool.map(_make_side, (pair.left, pair.right), maps_px, fine or (None, None)))
         self._looks = looks.result()
         self._hidden: dict[bool, HiddenBackground] = {}
         self._confidence = np.require(estimate.confidence, np.float32, ["C", "W"])
@@ -91,6 +95,16 @@ class Renderer:
             offset_px = (position - 0.5) * self.convergence_px + position * camera.doffs_px
             canvas = move_camera(canvas, camera, offset_px, up, forward)
         return View(image=canvas.image, drawn=canvas.drawn)
+
+    def fine_view(self, position: float) -> Float32[np.ndarray, "h w 3"]:
+        """Render the view from a position in the bits of `fine`, from 0 to 255; see `view`."""
+        if self.fine is None:
+            raise StereoweaveError("fine: expected two pictures for a view in more than 8 bits, found none")
+        position = check_position(position, strength=self.strength)
+        if position in (0, 1) and not self.convergence_px:
+            return self.fine[int(position)].copy()
+        # The kernels add a half, which rounds where images are of whole numbers.
+        return np.clip(self._draw(float(position)).image - np.float32(0.5), 0, 255)
 
     def _draw(self, position: float) -> "Canvas":
         """Render the view from a position on the line through the cameras, with holes filled."""
@@ -222,7 +236,22 @@ def _check_shifts(strength: float, convergence_px: float, pair: StereoPair) -> N
         )
 
 
-def _make_side(image: UInt8[np.ndarray, "h w 3"], disparity_px: Float[np.ndarray, "h w"]) -> "Side":
+def _check_fine(fine: object, pair: StereoPair) -> None:
+    if fine is None:
+        return
+    images = fine if isinstance(fine, tuple) else ()
+    shape = pair.left.shape
+    if [(getattr(x, "dtype", None), getattr(x, "shape", None)) for x in images] != [(np.float32, shape)] * 2:
+        raise StereoweaveError(
+            f"fine: expected a tuple of two float32 arrays {list(shape)}, found {type(fine).__name__}"
+        )
+
+
+def _make_side(
+    image: UInt8[np.ndarray, "h w 3"],
+    disparity_px: Float[np.ndarray, "h w"],
+    fine: Float32[np.ndarray, "h w 3"] | None,
+) -> "Side":
     """Pack an input image and its maps for the kernels; the fields that depend on the view are 0."""
     from stereoweave.rendering.canvas_kernels import Side
 
@@ -230,7 +259,7 @@ def _make_side(image: UInt8[np.ndarray, "h w 3"], disparity_px: Float[np.ndarray
     image = np.require(image, np.uint8, ["C", "W"])
     disparity_px = np.require(disparity_px, np.float32, ["C", "W"])
     return Side(
-        image=image,
+        image=image if fine is None else np.require(fine, np.float32, ["C", "W"]),
         grey=cv2.cvtColor(image, cv2.COLOR_RGB2GRAY),
         disparity_px=disparity_px,
         nearer_px=cv2.dilate(disparity_px, np.ones((3, 3), np.uint8)) - disparity_px,
@@ -241,13 +270,17 @@ def _make_side(image: UInt8[np.ndarray, "h w 3"], disparity_px: Float[np.ndarray
 
 
 def _recolour(
-    image: UInt8[np.ndarray, "h w 3"], table: Float[np.ndarray, "256 3"] | None
+    image: Num[np.ndarray, "h w 3"], table: Float[np.ndarray, "256 3"] | None
 ) -> dict[str, np.ndarray]:
     """Return a side's image and grey levels, recoloured with a table; an empty dict if there is no table."""
     if table is None:
         return {}
-    coloured = recolour(image, table)
-    return {"image": coloured, "grey": cv2.cvtColor(coloured, cv2.COLOR_RGB2GRAY)}
+    if image.dtype == np.uint8:
+        coloured = recolour(image, table)
+        return {"image": coloured, "grey": cv2.cvtColor(coloured, cv2.COLOR_RGB2GRAY)}
+    levels = np.arange(256, dtype=np.float32)
+    fine = np.dstack([np.interp(image[..., at], levels, table[:, at]) for at in range(3)]).astype(np.float32)
+    return {"image": fine, "grey": cv2.cvtColor(np.rint(fine).astype(np.uint8), cv2.COLOR_RGB2GRAY)}
 
 
 def _assume_camera(estimate: Estimate) -> StereoCamera:

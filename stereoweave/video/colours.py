@@ -18,7 +18,7 @@ _UNTAGGED = 0, 2  # AVCOL_SPC_RGB, which some encoders write for "unknown", and 
 # AVColorTransferCharacteristic of HDR, and AVCOL_PRI_BT709.
 _PQ, _HLG = 16, 18
 _HDR = {_PQ: "PQ", _HLG: "HLG"}
-_PRIMARIES_BT709 = 1
+_PRIMARIES_BT709, _PRIMARIES_BT2020 = 1, 9
 
 # Luminance of a white surface and of the brightest highlights (ITU-R BT.2408). The first becomes SDR's peak.
 _WHITE_NITS, _PEAK_NITS = 203.0, 1000.0
@@ -28,6 +28,8 @@ _BT2020_TO_BT709 = np.array(
     [[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]], np.float32
 )
 _LUMA_BT2020 = np.array([[0.2627, 0.6780, 0.0593]], np.float32)
+# To rgb48le, FFmpeg converts some dark colours of 4:2:0 wrongly.
+_DEEP_RGB = "gbrp16le"
 # FFmpeg's conversion to 16-bit RGB makes this of white; it rounds to 65283.
 _WHITE_CODE = 255 * 256
 _HLG_GAMMA = 1.2  # of a display with the peak above
@@ -37,15 +39,33 @@ _GAINS = 4096
 def convert_to_rgb(frame: "av.VideoFrame") -> UInt8[np.ndarray, "h w 3"]:
     """Return a frame upright, as sRGB. HDR is tone-mapped."""
     if frame.color_trc in _HDR:
-        picture = _map_tones(_decode_rgb(frame, "rgb48le"), frame.color_trc, frame.color_primaries)
+        picture = _map_tones(_decode_rgb(frame, _DEEP_RGB), frame.color_trc, frame.color_primaries)
     else:
         picture = _decode_rgb(frame, "rgb24")
     return np.ascontiguousarray(np.rot90(picture, frame.rotation // 90))
 
 
+def convert_to_fine(frame: "av.VideoFrame") -> Float32[np.ndarray, "h w 3"]:
+    """Return a frame upright, as RGB in the file's own colours, HDR too; black is 0 and white 255."""
+    codes = _decode_rgb(frame, _DEEP_RGB).astype(np.float32)
+    codes *= 255 / _WHITE_CODE
+    return np.ascontiguousarray(np.rot90(codes, frame.rotation // 90))
+
+
 def name_hdr(frame: "av.VideoFrame") -> str | None:
     """Return the name of a frame's HDR transfer function, PQ or HLG; None for an ordinary frame."""
     return _HDR.get(frame.color_trc)
+
+
+def hdr_colours(frame: "av.VideoFrame") -> tuple[int, int, int] | None:
+    """Return the primaries, transfer function and matrix of an HDR frame, by FFmpeg's numbers; else None.
+
+    Primaries that the file does not state are those of BT.2020.
+    """
+    if frame.color_trc not in _HDR:
+        return None
+    primaries = _PRIMARIES_BT2020 if frame.color_primaries in _UNTAGGED else frame.color_primaries
+    return primaries, frame.color_trc, _BT2020
 
 
 def _decode_rgb(frame: "av.VideoFrame", format: str) -> np.ndarray:

@@ -13,10 +13,10 @@ from rich.console import Console
 from rich.progress import Progress
 
 from stereoweave import __version__
-from stereoweave.errors import StereoweaveError
+from stereoweave.errors import Remedy, StereoweaveError
 from stereoweave.io.output_lock import lock_output
-from stereoweave.rendering.rehearsals import rehearse_drawing, rehearse_filling
-from stereoweave.system.compiling_ahead import compile_ahead
+from stereoweave.rendering.rehearsals import rehearse_drawing, rehearse_filling, rehearse_fine_drawing
+from stereoweave.system.compiling_ahead import Rehearsal, compile_ahead
 from stereoweave.system.progress import progress
 from stereoweave.system.threads import thread_count
 from stereoweave.video.carried_frames import rehearse_carrying
@@ -29,7 +29,19 @@ from stereoweave.video.reader import StereoVideo, format_time
 from stereoweave.video.sphere_output import WholeOutput
 from stereoweave.video.survey import survey_video
 from stereoweave.video.tracks import list_picture_files
-from stereoweave.video.writer import GREY16, H264, Packing, Picture, Recorder, check_container
+from stereoweave.video.writer import (
+    BT709,
+    DEPTH10,
+    GREY16,
+    H264,
+    HEVC10,
+    Colours,
+    Encoding,
+    Packing,
+    Picture,
+    Recorder,
+    check_container,
+)
 
 # Length of a part, which begins with a key frame. An interrupted run loses only the unfinished part.
 PART_S = 4
@@ -67,15 +79,16 @@ def convert_video(
     _check_output(out, job, video, sources)
     job = _fit_to_sphere(job, video)
     matcher = load_matcher(job)
-    compile_ahead(
-        rehearse_carrying, *(() if job.depth or job.depth16 else (rehearse_drawing, rehearse_filling))
-    )
+    compile_ahead(rehearse_carrying, *_list_rehearsals(job))
+    if job.is_fine:
+        video.read_fine()
     recorder = Recorder(
-        encoding=GREY16 if job.depth16 else H264,
+        encoding=_choose_encoding(job),
         time_base=video.time_base,
         # FFmpeg stores numerators and denominators in 32 bits.
         rate=video.rate.limit_denominator(100_000),
         packing=PACKINGS.get(job.layout or ""),
+        colours=Colours(*video.hdr_colours) if job.is_fine and video.hdr_colours else BT709,
         threads=thread_count(job.backend.threads),
     )
     with (
@@ -115,7 +128,12 @@ def _fit_to_sphere(job: VideoJob, video: StereoVideo) -> VideoJob:
     job = replace(job, rectify=job.rectify and video.sphere.is_flat)
     if not video.sphere.is_whole:
         return job
-    return replace(job, whole=WholeOutput(video.sphere, job.layout, grey16=job.depth16))
+    if job.depth16 or job.depth10 or job.is_fine:
+        raise StereoweaveError(
+            "expected 8 bits for the whole field of view, found more",
+            remedy=Remedy("leave them out", ("depth10", "depth16", "bits")),
+        )
+    return replace(job, whole=WholeOutput(video.sphere, job.layout))
 
 
 def _mark_output(job: VideoJob, video: StereoVideo, *, warped: bool) -> VideoMarks | None:
@@ -131,6 +149,20 @@ def _mark_output(job: VideoJob, video: StereoVideo, *, warped: bool) -> VideoMar
         strength=job.strength,
         convergence_px=job.convergence_px or 0.0,
     )
+
+
+def _choose_encoding(job: VideoJob) -> Encoding:
+    if job.depth16:
+        return GREY16
+    if job.depth10:
+        return DEPTH10
+    return H264 if job.bits == 8 else HEVC10
+
+
+def _list_rehearsals(job: VideoJob) -> tuple[Rehearsal, ...]:
+    if job.depth or job.depth10 or job.depth16:
+        return ()
+    return (rehearse_fine_drawing,) if job.is_fine else (rehearse_drawing, rehearse_filling)
 
 
 class _Meter:
@@ -174,9 +206,11 @@ def _list_settings(job: VideoJob, video: StereoVideo, sources: Sequence[Path]) -
     model = Path(job.backend.model)
     return {
         "depth": job.depth,
+        "depth10": job.depth10,
         "depth16": job.depth16,
         "position": job.position,
         "layout": job.layout,
+        "bits": job.bits,
         "strength": job.strength,
         "rectify": job.rectify,
         "convergence_px": job.convergence_px,

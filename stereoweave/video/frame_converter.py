@@ -130,7 +130,10 @@ class FrameConverter:
     def _render(self, estimated: EstimatedFrame) -> tuple[Fraction, Picture]:
         frame, pair, estimate = estimated
         self.tally.add(frame)
-        return frame.time, self._squeezed.job.render_frame(pair, estimate, self._seen)
+        job = self._squeezed.job
+        if frame.fine:
+            return frame.time, job.render_fine_frame(frame.fine(), estimate, self._seen)
+        return frame.time, job.render_frame(pair, estimate, self._seen)
 
     def _overlap(self, items: Iterable[Item], count: int) -> Iterator[Item]:
         """Compute items ahead of their use, if more than one thread is allowed."""

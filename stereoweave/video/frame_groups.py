@@ -1,6 +1,6 @@
 """Frames of a video in groups, each of which ends with a frame to match; aligned, shot by shot."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from typing import NamedTuple
 
@@ -20,7 +20,7 @@ class FrameGroup(NamedTuple):
     """Consecutive frames, of which only the last one is matched.
 
     Attributes:
-        frames: The frames as read.
+        frames: The frames as read; only their fine pictures are aligned.
         pairs: The aligned pairs of the frames.
     """
 
@@ -51,10 +51,10 @@ class FrameGrouper:
             grey = _make_thumbnail(several[-1])
             if len(several) > 1 and not self._begins_shot(grey):
                 self._last_grey = grey
-                yield FrameGroup(several, [*map(self._align, several)])
+                yield _make_group([self._align(frame) for frame in several])
                 continue
             for frame in several:
-                yield FrameGroup([frame], [self._begin(frame)])
+                yield _make_group([self._begin(frame)])
 
     @property
     def has_warped(self) -> bool:
@@ -71,8 +71,8 @@ class FrameGrouper:
         """Restore a grouper from a saved `state`."""
         return cls(ShotAligner.from_state(state) if "aligner" in state else None, state.get("last_grey"))
 
-    def _begin(self, frame: StereoFrame) -> StereoPair:
-        """Return a frame's aligned pair; if the frame begins a shot, its rows are measured."""
+    def _begin(self, frame: StereoFrame) -> tuple[StereoFrame, StereoPair]:
+        """Return a frame and its aligned pair; if the frame begins a shot, its rows are measured."""
         grey = _make_thumbnail(frame)
         if self._aligner and self._last_grey is not None and self._begins_shot(grey):
             self._aligner.begin_shot()
@@ -84,9 +84,16 @@ class FrameGrouper:
             return True
         return measure_motion(self._last_grey, grey).explained_share < CUT_SHARE
 
-    def _align(self, frame: StereoFrame) -> StereoPair:
+    def _align(self, frame: StereoFrame) -> tuple[StereoFrame, StereoPair]:
         pair = StereoPair(left=frame.left, right=frame.right)
-        return self._aligner(pair) if self._aligner else pair
+        if self._aligner is None:
+            return frame, pair
+        aligned = self._aligner(pair)
+        return frame.change_fine(self._aligner.align_fine()), aligned
+
+
+def _make_group(aligned: Sequence[tuple[StereoFrame, StereoPair]]) -> FrameGroup:
+    return FrameGroup([frame for frame, _ in aligned], [pair for _, pair in aligned])
 
 
 def _make_thumbnail(frame: StereoFrame) -> UInt8[np.ndarray, "h w"]:

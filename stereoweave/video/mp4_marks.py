@@ -8,13 +8,14 @@ descriptions (ISO/IEC 14496-12) of a finished file.
 import os
 import shutil
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 from stereoweave.errors import FormatError, StereoweaveError
+from stereoweave.io.boxes import Box, change_boxes, make_box, make_full_box, split_boxes
 from stereoweave.io.files import replacing
 
 # stereo_mode of `st3d`, without and with the right view first; None where the RFC has no number. Then the
@@ -83,9 +84,8 @@ class VideoMarks:
             ("projection", self.projection, _PROJECTIONS),
         ):
             if value not in known:
-                raise StereoweaveError(
-                    f"expected one of {', '.join(map(str, known))}, found {value!r}", setting=name
-                )
+                choices = ", ".join(map(str, known))
+                raise StereoweaveError(f"{name}: expected one of {choices}, found {value!r}")
         whole_deg = _COVERED_DEG.get(self.projection, (_MOST_DEG, 0.0))
         for name, number, most in (
             ("field_of_view_deg", self.field_of_view_deg, whole_deg[0]),
@@ -93,26 +93,16 @@ class VideoMarks:
             ("baseline_m", self.baseline_m, _MOST_BASELINE_M),
         ):
             if number is not None and not 0 < number <= most:
-                raise StereoweaveError(
-                    f"expected a number above 0 and at most {most:g}, found {number}", setting=name
-                )
+                raise StereoweaveError(f"{name}: expected above 0 and at most {most:g}, found {number}")
         if not abs(self.adjustment_percent) <= 100:
             raise StereoweaveError(
-                f"expected -100 to 100 percent, found {self.adjustment_percent}", setting="adjustment_percent"
+                f"adjustment_percent: expected -100 to 100 percent, found {self.adjustment_percent}"
             )
 
     @property
     def is_panorama(self) -> bool:
         """Whether the views cover a sphere, or a part of it, equirectangularly."""
         return self.projection in _COVERED_DEG
-
-
-class _Box(NamedTuple):
-    """A box: its type, its content, and all of its bytes. The type is empty for bytes that are no box."""
-
-    kind: bytes
-    content: bytes
-    whole: bytes
 
 
 class _Place(NamedTuple):
@@ -184,23 +174,23 @@ def mark_index(index: bytes, marks: VideoMarks, *, moved_from: int | None = None
     """
     if index[:4] == bytes(4):  # up to the end of the file
         index = struct.pack(">I", len(index)) + index[4:]
-    [moov, *rest] = _split_boxes(index) or [_Box(b"", b"", b"")]
+    [moov, *rest] = split_boxes(index) or [Box(b"", b"", b"")]
     if moov.kind != b"moov" or rest:
         raise FormatError("expected an index (moov), found a damaged one; write the file again")
-    count = sum(_is_video(box.content) for box in _split_boxes(moov.content) if box.kind == b"trak")
+    count = sum(_is_video(box.content) for box in split_boxes(moov.content) if box.kind == b"trak")
     if count != 1:
         raise FormatError(
             f"expected an index with one video track, found {count or 'none'}; "
             "write the file again with one video track"
         )
     boxes = make_boxes(marks)
-    new = make_box(b"moov", _change(moov.content, (b"trak",), lambda track: _mark_track(track, boxes)))
+    new = make_box(b"moov", change_boxes(moov.content, (b"trak",), lambda track: _mark_track(track, boxes)))
     if moved_from is None:
         return new
     grown = len(new) - len(index)
     for kind, number in ((b"stco", "I"), (b"co64", "Q")):
         move = partial(_move_chunks, number=number, moved_from=moved_from, by=grown)
-        new = _change(new, (b"moov", b"trak", *_TABLE, kind), move)
+        new = change_boxes(new, (b"moov", b"trak", *_TABLE, kind), move)
     return new
 
 
@@ -210,18 +200,18 @@ def make_boxes(marks: VideoMarks) -> tuple[bytes, bytes]:
     google = b""
     stereo_mode = swapped_mode if marks.right_first else mode
     if stereo_mode is not None and (marks.packing or marks.is_panorama):
-        google += _make_full_box(b"st3d", bytes([stereo_mode]))
+        google += make_full_box(b"st3d", bytes([stereo_mode]))
     if marks.is_panorama:
         google += _make_sv3d(marks)
     parts = []
     # A part of a sphere is neither the whole nor the half one that Apple's names mean.
     is_part = marks.is_panorama and _find_covered_deg(marks) != _COVERED_DEG[marks.projection]
     if marks.projection != "rectilinear" and not is_part:
-        kind = _make_full_box(b"prji", _PROJECTIONS[marks.projection])
+        kind = make_full_box(b"prji", _PROJECTIONS[marks.projection])
         parts.append(make_box(b"proj", kind))
     if marks.packing:
         parts.append(_make_eyes(marks))
-        parts.append(make_box(b"pack", _make_full_box(b"pkin", packing)))
+        parts.append(make_box(b"pack", make_full_box(b"pkin", packing)))
     apple = make_box(b"vexu", b"".join(parts)) if parts else b""
     degrees = marks.field_of_view_deg or _COVERED_DEG.get(marks.projection, (0.0, 0.0))[0]
     if degrees:
@@ -229,26 +219,14 @@ def make_boxes(marks: VideoMarks) -> tuple[bytes, bytes]:
     return google, apple
 
 
-def make_box(kind: bytes, content: bytes) -> bytes:
-    """Return a box of this type."""
-    if len(content) + 8 < 1 << 32:
-        return struct.pack(">I4s", len(content) + 8, kind) + content
-    return struct.pack(">I4sQ", 1, kind, len(content) + 16) + content
-
-
-def _make_full_box(kind: bytes, content: bytes) -> bytes:
-    """Return a box of version 0, without flags."""
-    return make_box(kind, bytes(4) + content)
-
-
 def _make_eyes(marks: VideoMarks) -> bytes:
     views = _HAS_LEFT | _HAS_RIGHT | (_RIGHT_FIRST if marks.right_first else 0)
-    parts = _make_full_box(b"stri", bytes([views])) + _make_full_box(b"hero", bytes([_LEFT_IS_HERO]))
+    parts = make_full_box(b"stri", bytes([views])) + make_full_box(b"hero", bytes([_LEFT_IS_HERO]))
     if marks.baseline_m:
-        parts += make_box(b"cams", _make_full_box(b"blin", struct.pack(">I", round(1e6 * marks.baseline_m))))
+        parts += make_box(b"cams", make_full_box(b"blin", struct.pack(">I", round(1e6 * marks.baseline_m))))
     if marks.adjustment_percent:
         adjustment = struct.pack(">i", round(100 * marks.adjustment_percent))
-        parts += make_box(b"cmfy", _make_full_box(b"dadj", adjustment))
+        parts += make_box(b"cmfy", make_full_box(b"dadj", adjustment))
     return make_box(b"eyes", parts)
 
 
@@ -262,20 +240,22 @@ def _make_sv3d(marks: VideoMarks) -> bytes:
     width_deg, height_deg = _find_covered_deg(marks)
     # What is missing at each side, as a share of the sphere in 0.32 bits.
     across, down = (round((1 - share) / 2 * (1 << 32)) for share in (width_deg / 360, height_deg / 180))
-    bounds = _make_full_box(b"equi", struct.pack(">4I", down, down, across, across))
-    pose = _make_full_box(b"prhd", bytes(12))
-    return make_box(b"sv3d", _make_full_box(b"svhd", _SOURCE) + make_box(b"proj", pose + bounds))
+    bounds = make_full_box(b"equi", struct.pack(">4I", down, down, across, across))
+    pose = make_full_box(b"prhd", bytes(12))
+    return make_box(b"sv3d", make_full_box(b"svhd", _SOURCE) + make_box(b"proj", pose + bounds))
 
 
 def _mark_track(track: bytes, boxes: tuple[bytes, bytes]) -> bytes:
     if not _is_video(track):
         return track
-    return _change(track, (*_TABLE, b"stsd"), lambda table: _mark_descriptions(table, boxes), needed=True)
+    return change_boxes(
+        track, (*_TABLE, b"stsd"), lambda table: _mark_descriptions(table, boxes), needed=True
+    )
 
 
 def _mark_descriptions(table: bytes, boxes: tuple[bytes, bytes]) -> bytes:
     """Return the content of `stsd` with boxes in each sample description."""
-    entries = [box for box in _split_boxes(table[_STSD_BYTES:]) if box.kind]
+    entries = [box for box in split_boxes(table[_STSD_BYTES:]) if box.kind]
     if not entries or len(entries) != int.from_bytes(table[4:_STSD_BYTES]):
         raise FormatError(
             "expected a sample description in the index, found a damaged one; write the file again"
@@ -289,7 +269,7 @@ def _mark_entry(entry: bytes, boxes: tuple[bytes, bytes]) -> bytes:
     if len(entry) < _ENTRY_BYTES:
         raise FormatError("expected a sample description of video, found one cut off; write the file again")
     google, apple = boxes
-    kept = [box for box in _split_boxes(entry[_ENTRY_BYTES:]) if box.kind not in _MARKS]
+    kept = [box for box in split_boxes(entry[_ENTRY_BYTES:]) if box.kind not in _MARKS]
     # QuickTime may end the description with four zeros, which are no box.
     first = next((at for at, box in enumerate(kept) if box.kind in _OPTIONAL or not box.kind), len(kept))
     last = len(kept) - 1 if kept and not kept[-1].kind else len(kept)
@@ -298,9 +278,9 @@ def _mark_entry(entry: bytes, boxes: tuple[bytes, bytes]) -> bytes:
 
 
 def _is_video(track: bytes) -> bool:
-    media = [box.content for box in _split_boxes(track) if box.kind == b"mdia"]
+    media = [box.content for box in split_boxes(track) if box.kind == b"mdia"]
     return any(
-        box.kind == b"hdlr" and box.content[8:12] == b"vide" for boxes in media for box in _split_boxes(boxes)
+        box.kind == b"hdlr" and box.content[8:12] == b"vide" for boxes in media for box in split_boxes(boxes)
     )
 
 
@@ -314,49 +294,6 @@ def _move_chunks(table: bytes, number: str, moved_from: int, by: int) -> bytes:
     if moved and max(moved) >= 1 << 8 * size:
         raise FormatError("expected a file below 4 GB, or with its index at the end; write the file again")
     return table[:8] + struct.pack(f">{count}{number}", *moved) + table[8 + count * size :]
-
-
-def _change(
-    boxes: bytes, way: Sequence[bytes], change: Callable[[bytes], bytes], *, needed: bool = False
-) -> bytes:
-    """Return boxes after a change of the content of each box at the end of the way through their types.
-
-    Raises:
-        FormatError: A box is damaged; or `needed` is true and there is none on the way.
-    """
-    kind, *rest = way
-    found = _split_boxes(boxes)
-    if needed and not any(box.kind == kind for box in found):
-        raise FormatError(f"expected the box {kind.decode()} in the index, found none; write the file again")
-    return b"".join(
-        make_box(kind, _change(box.content, rest, change, needed=needed) if rest else change(box.content))
-        if box.kind == kind
-        else box.whole
-        for box in found
-    )
-
-
-def _split_boxes(content: bytes) -> list[_Box]:
-    """Return the boxes that follow one another. A rest, shorter than a box, is the last one, without a type.
-
-    Raises:
-        FormatError: A box is longer than what holds it.
-    """
-    found, start = [], 0
-    while len(content) - start >= 8:
-        size, kind = struct.unpack_from(">I4s", content, start)
-        head = 16 if size == 1 else 8
-        if size == 1:
-            size = int.from_bytes(content[start + 8 : start + 16])
-        end = start + size
-        if size < head or end > len(content):
-            raise FormatError(
-                f"expected boxes that fit into the index, found {kind!r} with {size} bytes at the place of "
-                f"{len(content) - start}; write the file again"
-            )
-        found.append(_Box(kind, content[start + head : end], content[start:end]))
-        start = end
-    return [*found, _Box(b"", b"", content[start:])] if start < len(content) else found
 
 
 def _find_places(file: BinaryIO) -> Iterator[_Place]:

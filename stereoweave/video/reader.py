@@ -3,7 +3,9 @@
 import copy
 import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -28,6 +30,9 @@ _AFTER_DAMAGE = "decoded from a damaged frame before it"
 _RETIMED = "its timestamp was missing or a duplicate, so it is shown slightly later"
 
 
+FinePair = tuple[np.ndarray, np.ndarray]
+
+
 class StereoFrame(NamedTuple):
     """Pair of frames from a video.
 
@@ -36,12 +41,20 @@ class StereoFrame(NamedTuple):
         time: Exact time since the start of the video, in seconds.
         problem: Description of damage to this frame, of a changed timestamp, or of an early end of the
             video; None if there is no problem.
+        fine: Function that returns left and right with all their bits and in the file's own colours, HDR too,
+            float32 RGB from 0 to 255; None unless the video reads them.
     """
 
     left: UInt8[np.ndarray, "h w 3"]
     right: UInt8[np.ndarray, "h w 3"]
     time: Fraction
     problem: str | None
+    fine: Callable[[], FinePair] | None = None
+
+    def change_fine(self, change: Callable[[FinePair], FinePair]) -> "StereoFrame":
+        """Return the frame with a change of its fine pictures, which is made when they are needed."""
+        fine = self.fine
+        return self if fine is None else self._replace(fine=lambda: change(fine()))
 
 
 class StereoVideo:
@@ -64,6 +77,7 @@ class StereoVideo:
         declared_sphere: Projection of a VR180 or 360-degree video, if the file declares one.
         sphere: Of a VR180 or 360-degree video, the window that its frames show; see `show`.
         baseline_m: Distance of the eyes of such a video; None if it is unknown.
+        hdr_colours: Primaries, transfer function and matrix of HDR, by FFmpeg's numbers; None for SDR.
         on_frame: Function that `frames` calls with the number of each frame that it yields, to show progress.
     """
 
@@ -93,6 +107,13 @@ class StereoVideo:
         self.baseline_m: float | None = None
         self._cutter: Cutter | None = None
         self._first, self._last = 0, self.frame_count - 1
+        self.hdr_colours = first.hdr_colours
+        self._reads_fine = False
+
+    def read_fine(self) -> None:
+        """From now on, yield frames with fine pictures; notes no longer say that HDR is tone-mapped."""
+        self._reads_fine = True
+        self.notes = tuple(_note_kept(note) for note in self.notes)
 
     def show(self, view: SphereView, baseline_m: float | None, note: Note) -> "StereoVideo":
         """Return the same video with windows of its VR180 or 360-degree frames as frames."""
@@ -143,9 +164,14 @@ class StereoVideo:
                 left, right = self._cutter.cut(left), self._cutter.cut(right)
             time = (steps[index] - steps[first]) * self.time_base
             self.on_frame(index - first)
-            yield StereoFrame(
-                left, right, time, self._describe_problem(index, [problem for _, problem in seen])
-            )
+            problem = self._describe_problem(index, [problem for _, problem in seen])
+            fine = partial(self._split_fine, [shot for shot, _ in seen]) if self._reads_fine else None
+            yield StereoFrame(left, right, time, problem, fine)
+
+    def _split_fine(self, shots: Sequence[Shot]) -> FinePair:
+        pictures = [picture for shot in shots for picture in shot.fine_pictures()]
+        left, right = self._split.eyes(*pictures) if self._split else pictures
+        return (self._cutter.cut(left), self._cutter.cut(right)) if self._cutter else (left, right)
 
     def _describe_problem(self, index: int, problems: Sequence[str | None]) -> str | None:
         of_two = len(self._tracks) == 2
@@ -244,6 +270,10 @@ def check_unpacked(name: str, format: str | None) -> None:
             f"layers, found {format}",
             remedy=Remedy("leave it out", ("format",)),
         )
+
+
+def _note_kept(note: Note) -> Note:
+    return replace(note, text=note.text.replace("it is tone-mapped to SDR (BT.709)", "it is kept in 10 bits"))
 
 
 def _check_second_view(track: VideoTrack) -> None:

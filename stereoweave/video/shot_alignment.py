@@ -1,6 +1,6 @@
 """Alignment of a video: one rectification for each shot."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +11,7 @@ from stereoweave.cameras.picture_warp import PictureWarp
 from stereoweave.cameras.rectify_uncalibrated import apply_warps
 from stereoweave.cameras.row_field import RowField
 from stereoweave.stereo import StereoPair
+from stereoweave.video.reader import FinePair
 
 
 class ShotAligner:
@@ -40,6 +41,18 @@ class ShotAligner:
             return pair
         self.has_warped = True
         return _warp(pair, self._warps)
+
+    def align_fine(self) -> Callable[[FinePair], FinePair]:
+        """Return the change that the last frame underwent, for its fine pictures."""
+        swapped, warps = self._swapped, self._warps
+
+        def change(pair: FinePair) -> FinePair:
+            left, right = pair[::-1] if swapped else pair
+            if not warps:
+                return left, right
+            return warps.left.apply(left, None)[0], warps.right.apply(right, None)[0]
+
+        return change
 
     def begin_shot(self) -> None:
         """Measure the next frame."""

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 
 from stereoweave.cameras.sphere_windows import BLIND_DEG
-from stereoweave.errors import StereoweaveError
 from stereoweave.pictures.panoramas import SphereView, check_whole_layout, spread_views
 from stereoweave.stereo import Estimate
 from stereoweave.video.mp4_marks import VideoMarks
@@ -23,13 +22,11 @@ class WholeOutput:
     """Spreader of output frames over equirectangular ones, the same for a whole video.
 
     Raises:
-        StereoweaveError: The layout cannot show the whole field of view, or the output is 16-bit grey.
+        StereoweaveError: The layout cannot show the whole field of view.
     """
 
-    def __init__(self, view: SphereView, layout: str | None, *, grey16: bool) -> None:
+    def __init__(self, view: SphereView, layout: str | None) -> None:
         check_whole_layout(layout)
-        if grey16:
-            raise StereoweaveError("expected depth in colour for the whole field of view", setting="depth16")
         self._window, self._layout = view.window, layout
         self._spreader, self._name = view.spreader(), view.whole_projection.name
         self._blind = view.window.blindness_deg(view.window.rays()) > BLIND_DEG

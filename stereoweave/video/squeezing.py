@@ -11,6 +11,7 @@ from stereoweave.rendering.layouts import LAYOUTS, squeeze
 from stereoweave.stereo import StereoPair
 from stereoweave.video.frame_groups import FrameGroup
 from stereoweave.video.job import VideoJob
+from stereoweave.video.reader import FinePair
 from stereoweave.video.survey import Survey
 
 
@@ -38,7 +39,12 @@ class SqueezedJob(NamedTuple):
             StereoPair(left=squeeze(pair.left, self.axis), right=squeeze(pair.right, self.axis))
             for pair in group.pairs
         ]
-        return group._replace(pairs=pairs)
+        frames = [frame.change_fine(self._squeeze_fine) for frame in group.frames]
+        return FrameGroup(frames, pairs)
+
+    def _squeeze_fine(self, pair: FinePair) -> FinePair:
+        assert self.axis is not None
+        return squeeze(pair[0], self.axis), squeeze(pair[1], self.axis)
 
     def squeeze_survey(self, survey: Survey) -> Survey:
         """Return the disparities of the halved frames."""

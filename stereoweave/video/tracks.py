@@ -12,13 +12,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float32, UInt8
 
 from stereoweave.errors import FormatError, Note, Remedy, StereoweaveError, require_extra
 from stereoweave.io.decoding import ENDINGS
 from stereoweave.io.images import read_image
 from stereoweave.stereo import StereoCamera
-from stereoweave.video.colours import convert_to_rgb, name_hdr
+from stereoweave.video.colours import convert_to_fine, convert_to_rgb, hdr_colours, name_hdr
 from stereoweave.video.spatial import Stereo3D, ViewPair, is_spatial, pair_views, read_stereo3d
 from stereoweave.video.sphere_marks import SphereMark, read_sphere
 
@@ -55,11 +55,13 @@ class Shot(NamedTuple):
         pictures: Function that converts the frame to uint8 RGB [H, W, 3]; of a spatial video, to the left and
             the right view. It is called only for needed frames.
         is_key_frame: Whether the frame can be decoded without any earlier frame.
+        fine_pictures: The same pictures with all their bits and in the file's own colours, from 0 to 255.
     """
 
     number: int
     pictures: Callable[[], Sequence[UInt8[np.ndarray, "h w 3"]]]
     is_key_frame: bool
+    fine_pictures: Callable[[], Sequence[Float32[np.ndarray, "h w 3"]]]
 
 
 class VideoTrack:
@@ -79,6 +81,7 @@ class VideoTrack:
         camera: Camera of the views of a spatial video, if the file declares it and rotates no views.
         sphere: Projection of a VR180 or 360-degree video, if the file declares one.
         notes: Notes on views and colours.
+        hdr_colours: Primaries, transfer function and matrix of HDR, by FFmpeg's numbers; else None.
         sound: Path of the file if it has sound, else None.
         truncation: Message about a file that ends early; None for a complete file.
 
@@ -112,6 +115,7 @@ class VideoTrack:
         self._packed = declared if first.rotation % 360 == 0 and not self.is_spatial else Stereo3D()
         self.sphere = read_sphere(self.name, first)
         self.notes = [declared.note()] if self.is_spatial else []
+        self.hdr_colours = hdr_colours(first)
         if hdr := name_hdr(first):
             self.notes.append(Note(f"the video is HDR ({hdr}); it is tone-mapped to SDR (BT.709)"))
 
@@ -176,7 +180,12 @@ class VideoTrack:
             if all(
                 not view.is_corrupt and (view.width, view.height) == self._frame_size_px for view in views
             ):
-                yield Shot(index, partial(_convert_all, views), moment.key_frame)
+                yield Shot(
+                    index,
+                    partial(_convert_all, views),
+                    moment.key_frame,
+                    partial(_convert_all_fine, views),
+                )
 
     def _order_views(self, moment: "av.VideoFrame | ViewPair") -> Sequence["av.VideoFrame"]:
         """Return one frame, or the left and the right view of a spatial video."""
@@ -231,6 +240,7 @@ class PictureTrack:
     camera: StereoCamera | None = None
     sphere: SphereMark | None = None
     notes: Sequence[Note] = ()
+    hdr_colours: tuple[int, int, int] | None = None
     retimed: Collection[int] = ()
     sound: Path | None = None
     truncation: str | None = None
@@ -269,7 +279,9 @@ class PictureTrack:
 
     def _read_shot(self, index: int) -> Shot | None:
         picture = self._read_picture(index)
-        return None if picture is None else Shot(index, lambda: [picture], is_key_frame=True)
+        if picture is None:
+            return None
+        return Shot(index, lambda: [picture], True, lambda: [picture.astype(np.float32)])
 
     def _read_picture(self, index: int) -> UInt8[np.ndarray, "h w 3"] | None:
         with suppress(FormatError):
@@ -472,6 +484,10 @@ def _describe_error(error: "av.error.FFmpegError") -> str:
 
 def _convert_all(views: Sequence["av.VideoFrame"]) -> list[UInt8[np.ndarray, "h w 3"]]:
     return [convert_to_rgb(view) for view in views]
+
+
+def _convert_all_fine(views: Sequence["av.VideoFrame"]) -> list[Float32[np.ndarray, "h w 3"]]:
+    return [convert_to_fine(view) for view in views]
 
 
 def _name_packing(declared: Stereo3D) -> str | None:

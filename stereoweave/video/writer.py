@@ -48,7 +48,7 @@ _TRIED_PACKETS = 64
 # swscale's default conversion darkens everything by a level or two.
 _EXACT_COLOURS = Interpolation.BICUBIC | Interpolation.ACCURATE_RND
 
-Picture = UInt8[np.ndarray, "h w 3"] | UInt16[np.ndarray, "h w"]
+Picture = UInt8[np.ndarray, "h w 3"] | UInt16[np.ndarray, "h w 3"] | UInt16[np.ndarray, "h w"]
 
 
 class Encoding(NamedTuple):
@@ -66,8 +66,32 @@ class Encoding(NamedTuple):
 H264 = Encoding(
     "libx264", "yuv420p", ColorRange.MPEG, {"crf": "16", "preset": "faster", "bf": "0", "mbtree": "0"}
 )
+# The same in 10 bits; parts begin with frames to which no earlier ones are related.
+HEVC10 = Encoding(
+    "libx265",
+    "yuv420p10le",
+    ColorRange.MPEG,
+    {"crf": "16", "preset": "faster", "x265-params": "bframes=0:open-gop=0:log-level=error"},
+)
+# Values of depth must not change by more than a few steps.
+DEPTH10 = HEVC10._replace(options=dict(HEVC10.options) | {"crf": "8"})
 # Lossless. As is usual in archives, every frame is a key frame with checksums.
 GREY16 = Encoding("ffv1", "gray16le", ColorRange.JPEG, {"level": "3", "g": "1", "slicecrc": "1"})
+
+
+class Colours(NamedTuple):
+    """Meaning of a video's colours, by FFmpeg's numbers: primaries, transfer function and matrix."""
+
+    primaries: int
+    transfer: int
+    matrix: int
+
+
+BT709 = Colours(ColorPrimaries.BT709, ColorTrc.BT709, Colorspace.ITU709)
+# The value of both colour planes where there is no colour, in 10 bits.
+_NO_COLOUR_10 = 512
+# Apple's players accept HEVC only under this name.
+_HEVC_TAG = "hvc1"
 
 
 class Packing(NamedTuple):
@@ -85,10 +109,11 @@ class Recorder:
     """Encoder that writes the parts of a video and joins them.
 
     Attributes:
-        encoding: H264, or GREY16 for 16-bit grey.
+        encoding: H264, HEVC10 for 10 bits, or DEPTH10 or GREY16 for grey of 10 or 16 bits.
         time_base: Unit of all frame times, in seconds.
         rate: Frames per second; sets the duration of the last frame.
-        packing: Frame packing to declare in the file, if any.
+        packing: Frame packing to declare in the file, if any. HEVC itself cannot.
+        colours: Meaning of the colours.
         threads: Number of encoder threads.
     """
 
@@ -96,17 +121,19 @@ class Recorder:
     time_base: Fraction
     rate: Fraction
     packing: Packing | None = None
+    colours: Colours = BT709
     threads: int = 1
 
     def write_part(self, path: Path, pictures: Iterable[tuple[Fraction, Picture]]) -> None:
         """Write images of the same size, each with its time in seconds, to a NUT file.
 
-        H.264 halves the colour resolution, so an odd size is padded by repeating the last row or column.
+        Colours of 16 bits reach from 0 to 65280; grey is written as it is, in 10 or 16 bits. H.264 and HEVC
+        halve the colour resolution, so an odd size is padded by repeating the last row or column.
         """
         with av.open(str(path), "w", format="nut") as part:
             stream = None
             for time_s, picture in pictures:
-                frame = _make_frame(picture)
+                frame = self._make_frame(picture)
                 frame.pts, frame.time_base = round(time_s / self.time_base), self.time_base
                 stream = stream or self._add_stream(part, frame)
                 part.mux(stream.encode(frame))
@@ -168,6 +195,8 @@ class Recorder:
             container.metadata.update(metadata)
             first = stack.enter_context(av.open(str(parts[0])))
             stream = container.add_stream_from_template(first.streams.video[0], opaque=True)
+            if stream.codec_context.name == "hevc" and out.suffix.lower() != ".mkv":
+                stream.codec_context.codec_tag = _HEVC_TAG
             if self.packing:
                 stream.metadata["stereo_mode"] = self.packing.stereo_mode
             start_s, sound_packets = Fraction(0), []
@@ -182,17 +211,36 @@ class Recorder:
                 container.mux(packet)
 
     def _add_stream(self, part: OutputContainer, frame: VideoFrame) -> VideoStream:
-        """Add a video stream for frames of the same size as `frame`, in the colours of HD video (BT.709)."""
+        """Add a video stream for frames of the same size as `frame`."""
         options = dict(self.encoding.options)
-        if self.packing and self.packing.frame_packing is not None:
+        if self.encoding.codec == "libx265":
+            options["x265-params"] += f":pools={self.threads}"
+        elif self.packing and self.packing.frame_packing is not None:
             options["x264-params"] = f"frame-packing={self.packing.frame_packing}"
         stream = part.add_stream(self.encoding.codec, self.rate, options, time_base=self.time_base)
         assert isinstance(stream, VideoStream)
         stream.width, stream.height, stream.pix_fmt = frame.width, frame.height, self.encoding.pixel_format
         stream.thread_count = self.threads
-        stream.color_range, stream.colorspace = self.encoding.colour_range, Colorspace.ITU709
-        stream.color_primaries, stream.color_trc = ColorPrimaries.BT709, ColorTrc.BT709
+        stream.color_range, stream.colorspace = self.encoding.colour_range, self.colours.matrix
+        stream.color_primaries, stream.color_trc = self.colours.primaries, self.colours.transfer
         return stream
+
+    def _make_frame(self, picture: Picture) -> VideoFrame:
+        if self.encoding.pixel_format == GREY16.pixel_format:
+            return VideoFrame.from_ndarray(picture.astype(np.uint16, copy=False), GREY16.pixel_format)
+        height, width = picture.shape[:2]
+        even: Any = cv2.copyMakeBorder(picture, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
+        if even.ndim == 2:
+            # FFmpeg would take grey for full range, and convert it.
+            colourless = np.full((even.shape[0] // 2, even.shape[1]), _NO_COLOUR_10, np.uint16)
+            return VideoFrame.from_ndarray(np.vstack([even, colourless]), self.encoding.pixel_format)
+        return VideoFrame.from_ndarray(even, "rgb24" if even.dtype == np.uint8 else "rgb48le").reformat(
+            format=self.encoding.pixel_format,
+            src_color_range=ColorRange.JPEG,
+            dst_color_range=ColorRange.MPEG,
+            dst_colorspace=self.colours.matrix,
+            interpolation=_EXACT_COLOURS,
+        )
 
     def _read_packets(
         self, parts: Sequence[Path], stream: VideoStream, start_s: Fraction
@@ -222,20 +270,6 @@ def check_container(path: Path, sound: Path | None) -> None:
     remedy = f"use {others[0]} instead" if others else "convert the sound first, for example to FLAC"
     raise StereoweaveError(
         f"{path}: expected sound that {path.suffix} can hold, found {codecs} in {sound}; {remedy}"
-    )
-
-
-def _make_frame(picture: Picture) -> VideoFrame:
-    if picture.ndim == 2:
-        return VideoFrame.from_ndarray(picture.astype(np.uint16, copy=False), "gray16le")
-    height, width = picture.shape[:2]
-    even = cv2.copyMakeBorder(picture, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
-    return VideoFrame.from_ndarray(even.astype(np.uint8, copy=False), "rgb24").reformat(
-        format="yuv420p",
-        src_color_range=ColorRange.JPEG,
-        dst_color_range=ColorRange.MPEG,
-        dst_colorspace=Colorspace.ITU709,
-        interpolation=_EXACT_COLOURS,
     )
 
 

@@ -97,7 +97,7 @@ ERRORS = {
     f"view {PAIR} --layout diagonal -o out.png": "--layout: expected one of "
     f"{', '.join([*VIEW_LAYOUTS, *ANIMATIONS, VIEWER])}, found 'diagonal'",
     "video plain.png -o out.mp4": "expected one kind of output, found none; choose one (--depth, "
-    "--depth16, --position, --layout)",
+    "--depth10, --depth16, --position, --layout)",
     "video plain.png --depth -o out.mp4": "plain.png: expected a 3-D video, two views side by side or one "
     "above the other, found a picture that is too plain to tell; give two files, left and right; or choose "
     f"one of {LAYOUTS} (--format)",

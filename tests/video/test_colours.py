@@ -126,3 +126,12 @@ def test_ten_bits_without_hdr_are_read_as_eight(tmp_path, codec):
         assert np.abs(frame.left.astype(float) - left).mean() < 2.5
         assert np.abs(frame.right.astype(float) - right).mean() < 2.5
         assert np.abs((frame.left.astype(float) - left).mean(axis=(0, 1))).max() < 0.5
+
+
+@pytest.mark.parametrize("rgb_codes", [(0.35, 0.21, 0.14), (0.1, 0.02, 0.05), (0.78, 0.12, 0.47)])
+def test_hdr_with_halved_colours_as_cameras_write_it_looks_the_same(rgb_codes):
+    whole = hdr_frame(rgb_codes, HLG)
+    halved = whole.reformat(format="yuv420p10le")
+    halved.colorspace, halved.color_range = BT2020, 1
+    halved.color_trc, halved.color_primaries = HLG, BT2020
+    np.testing.assert_allclose(convert_to_rgb(halved).astype(int), convert_to_rgb(whole), atol=1)

@@ -271,7 +271,13 @@ def interrupt(patch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(
-    "words", [("--position", "0.4"), ("--layout", "rgbd"), ("--depth", "--threads", "2")]
+    "words",
+    [
+        ("--position", "0.4"),
+        ("--position", "0.4", "--bits", "10"),
+        ("--layout", "rgbd"),
+        ("--depth", "--threads", "2"),
+    ],
 )
 def test_an_interrupted_conversion_resumes_with_the_same_frames(tmp_path, monkeypatch, capsys, words):
     video = slow_video(tmp_path / "in.mp4")
@@ -392,7 +398,7 @@ def test_a_damaged_frame_is_reported_with_its_time_and_does_not_end_the_video(tm
 @pytest.mark.parametrize(
     ("out", "words", "told"),
     [
-        ("out.mp4", [], "found none; choose one (--depth, --depth16, --position, --layout)"),
+        ("out.mp4", [], "found none; choose one (--depth, --depth10, --depth16, --position, --layout)"),
         (
             "out.mp4",
             ["--depth", "--position", "0"],

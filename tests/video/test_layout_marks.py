@@ -77,3 +77,11 @@ def test_one_view_is_not_marked(tmp_path):
     assert run(SPATIAL, "-o", tmp_path / "out.mp4", "--position", "0.5", "--preview", "0.1s") == 0
     content = (tmp_path / "out.mp4").read_bytes()
     assert not any(kind in content for kind in (b"st3d", b"vexu", b"hfov"))
+
+
+@pytest.mark.testdata
+def test_the_camera_of_apples_video_is_kept_in_the_marks(testdata, tmp_path):
+    source = testdata / "consumer" / "stereo_spatial.mp4"
+    assert run(source, "-o", tmp_path / "out.mp4", "--layout", "side_by_side", "--no-rectify") == 0
+    # 19240 um and 63.4 degrees, as Apple's encoder wrote them; its adjustment is not applied to the pictures.
+    assert stereo_3d(tmp_path / "out_LRF_Full_SBS.mp4") == [1, 0, 0, 19240, 0, 1, 63400, 1000]

@@ -169,7 +169,7 @@ def test_a_view_and_the_depth_of_a_whole_film_have_one_eye(tmp_path, half_scene)
     [
         (["--layout", "quilt"], "expected one of side_by_side, crossed, top_bottom"),
         (["--layout", "side_by_side_half"], "for the whole field of view, found side_by_side_half"),
-        (["--depth16"], "--depth16: expected depth in colour for the whole field of view"),
+        (["--depth16"], "found more; leave them out (--depth10, --depth16, --bits)"),
         (["--depth", "--fov", "60"], "--fov: expected only for a window, found with the whole"),
         (["--depth", "--projection", "cube"], "rectilinear, equirectangular, half_equirectangular, fisheye"),
         (["--depth", "--projection", "rectilinear"], "--whole: expected only for VR180 and 360-degree files"),
