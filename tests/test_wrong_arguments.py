@@ -20,6 +20,8 @@ TEXTURED = Path(__file__).resolve().parent / "textured_pair"
 LEFT, RIGHT = (
     np.ascontiguousarray(read_image(TEXTURED / f"{side}.png")[200:264, 200:296]) for side in ("left", "right")
 )
+# Large enough for a window of at least 32 px.
+HALF_SPHERE = np.tile(LEFT, (4, 2, 1))
 FLAT = np.full((64, 96), 3.0, np.float32)
 FOUND = sw.Estimate(
     disparity_px=FLAT, right_disparity_px=FLAT, confidence=FLAT / 3, occluded=np.zeros((64, 96), bool)
@@ -98,6 +100,17 @@ def calls() -> list[Call]:
     fine = LEFT.astype(np.float32), RIGHT.astype(np.float32)
     return [
         Call("estimate", sw.estimate, **pair, **how, **steps, range_px=(0, 20), align="auto"),
+        Call(
+            "estimate of a window",
+            sw.estimate,
+            left=HALF_SPHERE,
+            right=HALF_SPHERE,
+            **how,
+            projection="fisheye",
+            look_deg=(10.0, 0.0),
+            fov_deg=60.0,
+            lens_fov_deg=190.0,
+        ),
         Call("Matcher", sw.Matcher, **how),
         Call("Matcher.estimate", matcher.estimate, **pair, **steps),
         Call("Matcher.estimate_many", matcher.estimate_many, pairs=[PAIR], **steps),

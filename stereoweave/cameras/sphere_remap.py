@@ -2,7 +2,7 @@
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Num, Shaped
+from jaxtyping import Bool, Shaped
 
 from stereoweave.cameras.sphere_windows import Window
 from stereoweave.cameras.spherical import Projection
@@ -36,7 +36,7 @@ class Cutter:
         self.seen: Bool[np.ndarray, "h w"] | None = None if seen.all() else seen
         self._border = cv2.BORDER_WRAP if projection.is_closed else cv2.BORDER_REPLICATE
 
-    def cut(self, image: Num[np.ndarray, "h w 3"]) -> Num[np.ndarray, "h2 w2 3"]:
+    def cut(self, image: Shaped[np.ndarray, "h w 3"]) -> Shaped[np.ndarray, "h2 w2 3"]:
         """Return the window of an image; black where the image shows nothing."""
         window = cv2.remap(image, self._places, self._shares, cv2.INTER_CUBIC, borderMode=self._border)
         if self.seen is not None:

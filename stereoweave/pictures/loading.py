@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from stereoweave.cameras.spherical import EQUIRECTANGULAR, HALF, RECTILINEAR, Projection, SphereRequest
+from stereoweave.cameras.spherical import RECTILINEAR, Projection, SphereRequest
 from stereoweave.errors import FormatError, Note, Remedy, StereoweaveError
 from stereoweave.io import exif, heif, lif, vr180
 from stereoweave.io.decoding import (
@@ -204,9 +204,9 @@ def _open_one(path: Path, format: str | None, sphere: SphereRequest) -> Opened:
     if name is None:
         name = _detect_picture_layout(path, image, has_depth=has_depth)
         why = "detected from name and content"
-    if vr180.is_panorama(xmp) or sphere.projection in (EQUIRECTANGULAR, HALF):
-        # Angles are shares of width and height, whatever their ratio: enlarging would add no detail.
-        name = name.removesuffix("_half")
+    if not format or sphere.projection is not None:
+        named = None if vr180.is_panorama(xmp) else str(path)
+        name = panoramas.choose_layout(name, named, (image.shape[1], image.shape[0]), sphere)
     notes = [Note(f"{name}, {why}", _OVERRIDE)] if why else []
     layout = PAIR_LAYOUTS[name]
     left, right = _split_views(path, image, layout)

@@ -19,7 +19,9 @@ from stereoweave.cameras.sphere_windows import (
 )
 from stereoweave.cameras.spherical import (
     EQUIRECTANGULAR,
+    FISHEYE,
     HALF,
+    RECTILINEAR,
     Projection,
     SphereRequest,
     describe_projection,
@@ -27,6 +29,7 @@ from stereoweave.cameras.spherical import (
 from stereoweave.errors import FormatError, Note, Remedy, StereoweaveError
 from stereoweave.io import vr180
 from stereoweave.io.decoding import DecodedPicture, decode_embedded
+from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS
 from stereoweave.stereo import StereoPair
 
 _OVERRIDE = Remedy("rectilinear is an ordinary picture", ("projection",))
@@ -128,6 +131,28 @@ def guess_projection(name: str, eye_size_px: tuple[int, int]) -> Projection | No
         if kind and abs(aspect / expected - 1) < _ASPECT_TOLERANCE:
             return Projection.named(kind)
     return None
+
+
+def choose_layout(
+    layout: str, name: str | None, frame_size_px: tuple[int, int], request: SphereRequest
+) -> str:
+    """Return the layout at full size, instead of half, for two equirectangular images in one frame.
+
+    Their angles are shares of width and height, whatever their ratio; enlarging them would add no detail. And
+    a VR180 film of square views looks like one of views at half width.
+
+    Args:
+        layout: The layout found, a name in `PAIR_LAYOUTS`.
+        name: Name of the file, which may state a projection; None if the file itself declares one.
+        frame_size_px: Width and height of the frame.
+        request: What the user asks for.
+    """
+    full = layout.removesuffix("_half")
+    if request.projection is not None:
+        return layout if request.projection in (RECTILINEAR, FISHEYE) else full
+    if name is None or full == layout:
+        return full
+    return full if guess_projection(name, PAIR_LAYOUTS[full].eye_size_px(*frame_size_px)) else layout
 
 
 def read_right_eye(path: Path, picture: Any, xmp: bytes) -> DecodedPicture | None:

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from stereoweave import __version__
-from stereoweave.errors import StereoweaveError
+from stereoweave.errors import Remedy, StereoweaveError
 from stereoweave.io.output_lock import lock_output
 from stereoweave.rendering.rehearsals import rehearse_drawing, rehearse_filling, rehearse_fine_drawing
 from stereoweave.system.compiling_ahead import Rehearsal, compile_ahead
@@ -143,13 +143,11 @@ def _fit_to_sphere(job: VideoJob, video: StereoVideo) -> VideoJob:
     job = replace(job, rectify=job.rectify and video.sphere.is_flat)
     if not video.sphere.is_whole:
         return job
-    if job.depth10 or job.depth16:
+    if job.depth16 or job.depth10 or job.is_fine:
         raise StereoweaveError(
-            "expected depth in colour for the whole field of view",
-            setting="depth10" if job.depth10 else "depth16",
+            "expected 8 bits for the whole field of view, found more",
+            remedy=Remedy("leave them out", ("depth10", "depth16", "bits")),
         )
-    if job.is_fine:
-        raise StereoweaveError(f"expected 8 for the whole field of view, found {job.bits}", setting="bits")
     return replace(job, whole=WholeOutput(video.sphere, job.layout))
 
 

@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import UInt8
 
 from stereoweave.cameras.sphere_remap import Cutter
-from stereoweave.cameras.spherical import FISHEYE, RECTILINEAR, SphereRequest
+from stereoweave.cameras.spherical import SphereRequest
 from stereoweave.errors import FormatError, Note, Remedy, StereoweaveError
 from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS, detect_layout
-from stereoweave.pictures.panoramas import SphereView, guess_projection
+from stereoweave.pictures.panoramas import SphereView, choose_layout, guess_projection
 from stereoweave.video.frame_sequence import FrameSequence
 from stereoweave.video.mvc import check_not_mvc
 from stereoweave.video.packings import FRAME_PACKINGS, FRAME_SEQUENTIAL, TWO_STREAMS
@@ -79,10 +79,10 @@ class StereoVideo:
             frame 1440 on; None for a whole video.
         notes: Notes on views and colours, and on the column or row that is dropped from frames of odd width
             or height.
-        hdr_colours: Primaries, transfer function and matrix of HDR, by FFmpeg's numbers; None for SDR.
         declared_sphere: Projection of a VR180 or 360-degree video, if the file declares one.
         sphere: Of a VR180 or 360-degree video, the window that its frames show; see `show`.
         baseline_m: Distance of the eyes of such a video; None if it is unknown.
+        hdr_colours: Primaries, transfer function and matrix of HDR, by FFmpeg's numbers; None for SDR.
         on_frame: Function that `frames` calls with the number of each frame that it yields, to show progress.
     """
 
@@ -258,9 +258,9 @@ def _open_single(path: Path, format: str | None, rate: Fraction | None, sphere: 
     if (format or track.declared_packing) in FRAME_SEQUENTIAL:
         return _open_sequence(track, format)
     name = format or detect_layout(track.name, track.samples(), track.declared_packing)
-    if track.sphere or sphere.projection not in (None, RECTILINEAR, FISHEYE):
-        # Angles are shares of width and height, whatever their ratio: enlarging would add no detail.
-        name = name.removesuffix("_half")
+    if not format or sphere.projection is not None:
+        named = None if track.sphere else track.name
+        name = choose_layout(name, named, track.size_px, sphere)
     try:
         return StereoVideo([track], name)
     except FormatError as error:

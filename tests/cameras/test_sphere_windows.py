@@ -1,3 +1,7 @@
+from fractions import Fraction
+
+import av
+import cv2
 import numpy as np
 import pytest
 from sphere_scenes import cast, look_equirectangular, look_fisheye, render_fixed, render_turning
@@ -126,6 +130,38 @@ def test_a_window_across_the_seam_of_a_360_degree_picture_is_continuous():
     steps = np.abs(np.diff(image, axis=1)).mean(axis=(0, 2))
     middle = window.size_px[0] // 2
     assert steps[middle - 2 : middle + 2].max() < 1.5 * np.median(steps)
+
+
+def project_by_ffmpeg(image, options):
+    """Return an equirectangular image in another projection, by FFmpeg's filter v360."""
+    graph = av.filter.Graph()
+    first = graph.add_buffer(
+        width=image.shape[1], height=image.shape[0], format="rgb24", time_base=Fraction(1, 25)
+    )
+    graph.link_nodes(first, graph.add("v360", options), graph.add("buffersink")).configure()
+    frame = av.VideoFrame.from_ndarray(image, "rgb24")
+    frame.pts, frame.time_base = 0, Fraction(1, 25)
+    graph.push(frame)
+    return graph.vpull().to_ndarray(format="rgb24")
+
+
+@pytest.mark.parametrize(
+    ("projection", "options"),
+    [
+        (Projection.named("fisheye", 190.0), "e:fisheye:h_fov=190:v_fov=190:w=512:h=512:interp=cubic"),
+        (HALF, "e:hequirect:w=512:h=512:interp=cubic"),
+    ],
+)
+def test_ffmpeg_projects_as_we_do(projection, options):
+    image, _ = cast(look_equirectangular((1024, 512), 360.0), np.array([0.0, 0, 0]))
+    image = cv2.GaussianBlur(image, (0, 0), 2)
+    projected = project_by_ffmpeg(image, options)
+    window = make_window(HALF, (512, 512), (30, -20), 60)
+    expected = Cutter(FULL, (1024, 512), window).cut(image).astype(float)
+    found = Cutter(projection, (512, 512), window).cut(projected)
+    assert np.abs(found - expected).mean() < 1.5
+    moved = np.roll(expected, 1, axis=1)
+    assert np.abs(moved - expected)[:, 1:].mean() > 3  # a pixel aside would differ more
 
 
 def test_what_a_fisheye_does_not_show_is_black_and_marked():

@@ -2,6 +2,7 @@ import struct
 from fractions import Fraction
 
 import av
+import cv2
 import numpy as np
 import pytest
 from spatial_examples import box, psnr_db
@@ -138,7 +139,10 @@ def test_the_maps_of_a_film_are_computed_once(tmp_path, half_scene, monkeypatch)
     ("layout", "packing"), [("side_by_side", "side_by_side"), ("top_bottom", "top_bottom")]
 )
 def test_the_whole_of_a_film_becomes_vr180_again(tmp_path, half_scene, layout, packing):
-    film = write_film(tmp_path / "a.mp4", half_scene, marks=VR180 | {"baseline_m": 0.063})
+    # Chroma of half resolution loses fine colours, whatever else is done.
+    left, right = (cv2.GaussianBlur(eye, (0, 0), 3) for eye in (half_scene.left, half_scene.right))
+    smooth = half_scene._replace(left=left, right=right)
+    film = write_film(tmp_path / "a.mp4", smooth, marks=VR180 | {"baseline_m": 0.063})
     assert run("video", film, "--whole", "--layout", layout, "-o", tmp_path / "b.mp4") == 0
     [out] = tmp_path.glob("b*.mp4")
     again = open_video([out])
@@ -165,7 +169,7 @@ def test_a_view_and_the_depth_of_a_whole_film_have_one_eye(tmp_path, half_scene)
     [
         (["--layout", "quilt"], "expected one of side_by_side, crossed, top_bottom"),
         (["--layout", "side_by_side_half"], "for the whole field of view, found side_by_side_half"),
-        (["--depth16"], "--depth16: expected depth in colour for the whole field of view"),
+        (["--depth16"], "found more; leave them out (--depth10, --depth16, --bits)"),
         (["--depth", "--fov", "60"], "--fov: expected only for a window, found with the whole"),
         (["--depth", "--projection", "cube"], "rectilinear, equirectangular, half_equirectangular, fisheye"),
         (["--depth", "--projection", "rectilinear"], "--whole: expected only for VR180 and 360-degree files"),
@@ -195,7 +199,6 @@ STEREO = box(b"st3d", bytes(4) + b"\2")
     [
         (STEREO + sv3d(box(b"cbmp", bytes(12))), "found a cubemap; convert it to an equirectangular one"),
         (STEREO + sv3d(equi(0, 0, 2**31 - 1, 2**31 - 1)), "its bounds (sv3d) are damaged"),
-        (STEREO + sv3d(equi(2**31, 2**31 - 1, 0, 0)), "its bounds (sv3d) are damaged"),
     ],
 )
 def test_a_film_of_an_impossible_projection_is_refused_in_one_line(tmp_path, half_scene, boxes, said):
@@ -210,6 +213,7 @@ def test_a_film_of_an_impossible_projection_is_refused_in_one_line(tmp_path, hal
     "boxes",
     [
         STEREO + sv3d(equi(2**32 - 1, 2**32 - 1, 2**32 - 1, 2**32 - 1)),
+        STEREO + sv3d(equi(2**31, 2**31 - 1, 0, 0)),
         STEREO + sv3d(equi(0, 0, 0, 0)[:-4]),
         STEREO + sv3d(b""),
         STEREO + sv3d(box(b"equi", b"")),
