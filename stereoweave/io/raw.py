@@ -1,7 +1,10 @@
 """Camera raw files, which rawpy (LibRaw) develops: colours, size and orientation."""
 
+import os
+import threading
 import warnings
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +31,8 @@ _SRGB_CURVE = (2.4, 12.92)
 _QUARTER_TURN = 4
 _EXIF, _LONGEST_SEGMENT = b"Exif\0\0", 65_533  # of a JPEG
 _LAST_ROWS_SHARE = 32
+# Two threads that discard at once would restore each other's discarding.
+_STDERR, _MUTED = 2, threading.Lock()
 
 
 def is_raw(path: Path, head: bytes) -> bool:
@@ -77,7 +82,8 @@ class RawImage(Image.Image):
             FormatError: The file is damaged.
         """
         if not self._is_loaded:
-            _calling_libraw(self._path, self._raw.unpack)
+            with _muting():
+                _calling_libraw(self._path, self._raw.unpack)
             self._check_complete()
             # Brightening each picture by its own histogram, as is usual, would make the two views unlike.
             pixels = _calling_libraw(
@@ -130,8 +136,27 @@ def open_raw(path: Path) -> RawImage:
     except StereoweaveError as missing:
         raise FormatError.from_error(missing) from missing
     raw = rawpy.RawPy()
-    _calling_libraw(path, lambda: raw.open_file(str(path)))
+    with _muting():
+        _calling_libraw(path, lambda: raw.open_file(str(path)))
     return RawImage(path, raw)
+
+
+@contextmanager
+def _muting() -> Iterator[None]:
+    """Discard what is written to stderr: LibRaw itself writes a line about damage there, beside our error."""
+    with _MUTED:
+        try:
+            kept = os.dup(_STDERR)
+        except OSError:  # a process without stderr
+            yield
+            return
+        with Path(os.devnull).open("wb") as nowhere:
+            os.dup2(nowhere.fileno(), _STDERR)
+        try:
+            yield
+        finally:
+            os.dup2(kept, _STDERR)
+            os.close(kept)
 
 
 def _calling_libraw(path: Path, call: Any) -> Any:

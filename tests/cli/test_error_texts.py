@@ -102,7 +102,7 @@ ERRORS = {
     "above the other, found a picture that is too plain to tell; give two files, left and right; or choose "
     f"one of {LAYOUTS} (--format)",
     "video plain.png --depth --format diagonal -o out.mp4": f"--format: expected one of {LAYOUTS}, "
-    "found 'diagonal'",
+    "frame_sequential, frame_sequential_right_first, two_streams, two_streams_right_first, found 'diagonal'",
     "synth make pylon --pairs 1 --size 8x8 -o set": "--size: expected 32 to 4096 px per side, found 8x8",
     "synth make pylon --pairs 1 --view 3 -o set": "--view: expected positions from -1.0 to 2.0 (0 is the "
     "left camera and 1 the right one), found 3.0",

@@ -1,3 +1,4 @@
+import os
 import struct
 import sys
 
@@ -163,11 +164,14 @@ def test_a_false_size_is_refused_before_memory_is_taken(tmp_path, width_px, heig
 
 
 @pytest.mark.parametrize("share", [0.02, 0.3, 0.6, 0.95])
-def test_a_raw_file_that_was_cut_off_is_refused(tmp_path, share):
+def test_a_raw_file_that_was_cut_off_is_refused(tmp_path, share, capfd):
     path = write_dng(tmp_path / "a.dng", patches())
     content = path.read_bytes()
     path.write_bytes(content[: int(share * len(content))])
     refusal(path)
+    assert capfd.readouterr().err == ""  # LibRaw would write a line of its own
+    os.write(2, b"heard again")
+    assert capfd.readouterr().err == "heard again"
 
 
 def test_empty_last_rows_are_named(tmp_path):
