@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from stereoweave.cameras.alignment import Alignment, check_pair
-from stereoweave.cameras.auto_align import align
+from stereoweave.cameras.auto_align import align_rows
 from stereoweave.matching.estimate import match
 from stereoweave.matching.matcher import Matcher
 from stereoweave.rendering.comfort import CONFIDENT, Depth, measure_depth
@@ -36,7 +36,7 @@ class FrameCheck:
 
     Attributes:
         time: Time of the frame in seconds.
-        depth: Disparities with the eyes as they should be: swapped back if they are swapped; None if unknown.
+        depth: Disparities of the rectified frame, with the eyes as they are, swapped or not; None if unknown.
         rows_px: Median vertical error.
         shift_px: Vertical shift of the right image; positive if it is lower.
         rotation_degrees: Clockwise rotation of the right image.
@@ -67,13 +67,14 @@ def check_frame(frame: StereoFrame, matcher: Matcher) -> FrameCheck:
         return FrameCheck(time=frame.time, defects=(empty,))
     whole = StereoPair(left=frame.left, right=frame.right)
     alignment = check_pair(whole.left, whole.right)
-    aligned = align(whole)
+    # Swapped eyes stay so: a vote on single frames would swap some of a shot and not others.
+    aligned = align_rows(whole)
     pair, scale = scale_down(aligned.pair)
     estimate = match(matcher, pair)
     gains = measure_gains(pair, estimate)
-    exposure_stops, colour_stops = _measure_light(alignment, gains, swapped=aligned.swapped)
+    exposure_stops, colour_stops = _measure_light(alignment, gains)
     defects: list[str] = [name for name in alignment.defects if name not in _NO_DEFECTS]
-    if aligned.swapped and "swapped" not in defects:
+    if "swapped" in aligned.alignment.defects and "swapped" not in defects:
         defects.append("swapped")
     if colour_stops > _TOLERATED_COLOUR_STOPS:
         defects.append("colour")
@@ -121,16 +122,14 @@ def measure_gains(pair: StereoPair, estimate: Estimate) -> Float[np.ndarray, " 3
     return np.array(gains)
 
 
-def _measure_light(
-    alignment: Alignment, gains: Float[np.ndarray, " 3"] | None, *, swapped: bool
-) -> tuple[float, float]:
-    """Return the differences in exposure and in colour in stops; the exposure of the right eye as it is."""
+def _measure_light(alignment: Alignment, gains: Float[np.ndarray, " 3"] | None) -> tuple[float, float]:
+    """Return the differences of the right image from the left one in exposure and in colour, in stops."""
     colour_stops = _NAN if gains is None else float(np.ptp(np.log2(gains)))
     if math.isfinite(alignment.exposure_ratio):
         return math.log2(alignment.exposure_ratio), colour_stops
     if gains is None:
         return _NAN, colour_stops
-    return float(np.median(np.log2(gains))) * (-1 if swapped else 1), colour_stops
+    return float(np.median(np.log2(gains))), colour_stops
 
 
 def _find_depth(alignment: Alignment, estimate: Estimate, scale: float) -> Depth | None:

@@ -76,15 +76,16 @@ def test_what_the_left_border_cuts_off_is_measured(found):
     assert found.shots[3].comfortable == ["light_field"]
 
 
-def test_a_swapped_shot_has_the_range_of_the_shot_with_its_eyes_in_order(found, matcher):
+def test_a_swapped_shot_is_measured_as_it_is_shown_with_near_and_far_exchanged(found, matcher):
     right_way = check_frame(frame_of(*shot_of(SHIP, 6)[-1]), matcher).depth
-    assert found.shots[1].depth.near_px == pytest.approx(right_way.near_px, abs=3)
+    assert found.shots[1].depth.far_px == pytest.approx(-right_way.near_px, abs=4)
+    assert found.shots[1].depth.near_px == pytest.approx(-right_way.far_px, abs=4)
 
 
 def test_depth_and_borders_are_defects_for_a_chosen_screen(found):
     chosen = [replace(shot, screen="light_field") for shot in found.shots]
     assert chosen[3].defects == ["cut_off"]
-    assert chosen[1].defects == ["swapped", "too_deep", "cut_off"]
+    assert chosen[1].defects == ["swapped", "too_deep"]
 
 
 def test_a_bluer_eye_differs_in_colour(matcher):
