@@ -180,9 +180,8 @@ def _render_videos(spec: RenderSpec, frames: int) -> Iterator[RenderedVideo]:
     yield add_passing_oval(pan, "nearing", (0.25, 0.0), nearing_px=0.5)
     yield pan
     # The flash is in a frame that is matched where every third one is.
-    flash = [
-        _FLASH if frame == frames // 2 // MATCHED_EVERY * MATCHED_EVERY else 1.0 for frame in range(frames)
-    ]
+    middle = frames // 2 // MATCHED_EVERY * MATCHED_EVERY
+    flash = [_FLASH if frame == middle else 1.0 for frame in range(frames)]
     yield expose(pan, "flash", flash)
     yield expose(pan, "fade", np.linspace(1, _FADED, frames).tolist())
 

@@ -23,6 +23,8 @@ _CALM_PX = 9
 _RESAMPLED = 0.3
 _MOVED, _MOVED_LEVELS, _MOVED_CONTRAST = 1.25, 0.5, 0.25
 _SPECKLE_PX = 5
+# A change of the mean grey level by more than this is a flash or a fast fade.
+_FLASH_LEVELS = 20.0
 # This filter is zero on a plane. Gaussian noise with a standard deviation of one level gives a standard
 # deviation of 6 levels, and a median absolute value of 0.674 * 6 levels.
 _ROUGHNESS = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
@@ -182,13 +184,27 @@ def match_brightness(
 ) -> UInt8[np.ndarray, "h2 w2"]:
     """Return the previous image with the mean and contrast of the new image.
 
-    Otherwise, a fade would count as a change of the scene.
+    Otherwise, a fade would count as a change of the scene. After a large change, as in a flash that makes a
+    part of the image white, each grey level becomes the level of the same rank in the new image.
     """
     (old_mean, old_contrast), (mean, contrast) = (
         [float(value[0, 0]) for value in cv2.meanStdDev(picture)] for picture in (before, grey)
     )
+    if abs(mean - old_mean) > _FLASH_LEVELS:
+        return _match_ranks(before, grey)
     gain = contrast / max(old_contrast, 1.0)
     return cv2.addWeighted(before, gain, before, 0, mean - gain * old_mean)
+
+
+def _match_ranks(
+    before: UInt8[np.ndarray, "h2 w2"], grey: UInt8[np.ndarray, "h2 w2"]
+) -> UInt8[np.ndarray, "h2 w2"]:
+    """Return the previous image with the histogram of the new image."""
+    counts, shown = (np.bincount(image.ravel(), minlength=256).cumsum() for image in (before, grey))
+    # The middle of a level's ranks decides, so that a level of many pixels is not moved up.
+    ranks = counts - np.diff(counts, prepend=0) / 2
+    levels = np.searchsorted(shown, ranks * (shown[-1] / counts[-1])).clip(0, 255)
+    return cv2.LUT(before, levels.astype(np.uint8))
 
 
 def _warp(
