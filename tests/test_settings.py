@@ -41,13 +41,13 @@ ABSENT = {
         *("align", "board", "convergence_px", "files", "forward", "layout", "left"),
         *("listed", "out", "provider", "quilt", "range_px", "raw", "refined"),
         *("right", "strength", "up"),
-        *("projection", "look_deg", "fov_deg", "lens_fov_deg", "whole"),
+        *("projection", "look_deg", "fov_deg", "lens_fov_deg", "whole", "size_px"),
     },
     "service": {
         *("align", "board", "convergence_px", "crop", "files", "forward", "layout", "left"),
         *("listed", "no_rectify", "out", "provider", "quilt", "raw"),
         *("right", "up"),
-        *("projection", "look_deg", "fov_deg", "lens_fov_deg", "whole"),
+        *("projection", "look_deg", "fov_deg", "lens_fov_deg", "whole", "size_px"),
     },
 }
 
