@@ -25,6 +25,7 @@ VARIABLE: dict[tuple[str, str], set[str]] = {
     ("cameras/spherical.py", "setting"): {"look_deg", "fov_deg"},
     ("app/pair_form.py", "setting"): {"focal_px", "baseline_m"},
     ("errors.py", "error.setting"): set(),  # of an error that another one takes the place of
+    ("outputs/sphere_views.py", "setting"): {"up", "forward", "size_px", "crop"},
     ("pictures/pair_finding.py", "side"): {"left", "right"},
     ("rendering/comfort.py", "name"): {"strength", "convergence_px"},
     ("rendering/renderer.py", "name"): {"up", "forward"},
@@ -41,13 +42,13 @@ ABSENT = {
         *("align", "board", "convergence_px", "files", "forward", "layout", "left"),
         *("listed", "out", "provider", "quilt", "range_px", "raw", "refined"),
         *("right", "screen", "strength", "up"),
-        *("projection", "look_deg", "fov_deg", "lens_fov_deg", "whole"),
+        *("projection", "look_deg", "fov_deg", "lens_fov_deg", "whole", "size_px"),
     },
     "service": {
         *("align", "board", "convergence_px", "crop", "files", "forward", "layout", "left"),
         *("listed", "no_rectify", "out", "provider", "quilt", "raw"),
         *("right", "screen", "up"),
-        *("projection", "look_deg", "fov_deg", "lens_fov_deg", "whole"),
+        *("projection", "look_deg", "fov_deg", "lens_fov_deg", "whole", "size_px"),
     },
 }
 

@@ -1,7 +1,9 @@
 """Pictures with one or two views, in every supported format, with tags, profiles and markers."""
 
+import base64
 import io
 import json
+import struct
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -50,7 +52,25 @@ def _starts() -> dict[str, bytes]:
         "leia.jpg": _encode_lif(left, right),
         "sensor.dng": _encode_dng(left),
         "above_TB.png": encode_picture(np.vstack([left, right]), "PNG"),
+        "eyes.vr.jpg": _encode_vr180(),
     }
+
+
+def _encode_vr180() -> bytes:
+    """Return a VR180 photo, large enough for a window, whose right eye is in two segments of extended XMP."""
+    left, right = (encode_picture(np.tile(eye, (3, 2, 1)), "JPEG") for eye in eyes())
+    values = {"FullPanoWidth": 288, "FullPanoHeight": 144}
+    values |= {"CroppedAreaImageWidth": 144, "CroppedAreaImageHeight": 144}
+    told = "".join(f' GPano:{name}Pixels="{value}"' for name, value in values.items())
+    guid, text = b"0" * 32, b'<x GImage:Data="' + base64.b64encode(right) + b'"/>'
+    main = f'<x{told} GPano:ProjectionType="equirectangular" xmpNote:HasExtendedXMP="{guid.decode()}"/>'
+    contents = [b"http://ns.adobe.com/xap/1.0/\0" + main.encode()]
+    for start in range(0, len(text), 1 + len(text) // 2):
+        place = struct.pack(">LL", len(text), start)
+        part = text[start : start + 1 + len(text) // 2]
+        contents.append(b"http://ns.adobe.com/xmp/extension/\0" + guid + place + part)
+    segments = [b"\xff\xe1" + struct.pack(">H", 2 + len(content)) + content for content in contents]
+    return left[:2] + b"".join(segments) + left[2:]
 
 
 def _encode_heic(*images: np.ndarray) -> bytes:

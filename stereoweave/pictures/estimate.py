@@ -81,22 +81,29 @@ def estimate(  # noqa: PLR0913 - all but the images are keyword-only and optiona
             notes += tuple(find_problems(prepared.pair, found, prepared.alignment, _RECTIFY_FIRST))
         return replace(found, pair=prepared.pair, notes=notes)
     given = StereoPair(left=as_rgb(left, "left"), right=as_rgb(right, "right"))
+    return _match_images(given, backend, options, sphere, aligned=bool(align))
+
+
+def _match_images(
+    given: StereoPair, backend: Backend, options: MatchOptions, sphere: SphereRequest, *, aligned: bool
+) -> Estimate:
+    """Match two images, or a window of them; align them first if asked for."""
     matcher = backend.matcher()
     chosen = sphere.choose("two images", None)
     if chosen:
         eye_size_px = given.left.shape[1], given.left.shape[0]
         given = cut_pair(given, SphereView.chosen(chosen, eye_size_px, sphere))
-    if not align:
+    if not aligned:
         found = match(matcher, given, options)
         return replace(found, pair=given) if chosen else found
-    aligned = auto_align.align(given)
-    found = match(matcher, aligned.pair, options)
+    ready = auto_align.align(given)
+    found = match(matcher, ready.pair, options)
     notes = (
-        *_fit_to_python(aligned.notes),
-        *find_problems(aligned.pair, found, aligned.alignment, _RECTIFY_FIRST),
+        *_fit_to_python(ready.notes),
+        *find_problems(ready.pair, found, ready.alignment, _RECTIFY_FIRST),
     )
-    is_given = aligned.pair is given and not chosen
-    return replace(found, pair=None if is_given else aligned.pair, notes=notes)
+    is_given = ready.pair is given and not chosen
+    return replace(found, pair=None if is_given else ready.pair, notes=notes)
 
 
 def _request_window(

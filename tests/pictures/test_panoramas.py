@@ -99,6 +99,7 @@ def test_a_name_states_the_projection_if_the_shape_fits(tmp_path, round_scene):
     images = round_scene.left, round_scene.right
     named = open_pictures([save(tmp_path / "room_360_TB.png", *images)])
     assert "equirectangular of 360x180 degrees, detected from the name" in named.notes[-1].text
+    assert str(named.notes[-1]).endswith("; rectilinear is an ordinary picture (projection)")
     assert open_pictures([save(tmp_path / "room.png", *images)], "top_bottom").sphere is None
     ordinary = SphereRequest(projection="rectilinear")
     assert open_pictures([tmp_path / "room_360_TB.png"], "top_bottom", ordinary).sphere is None
@@ -135,7 +136,7 @@ def test_a_window_has_metres_if_the_baseline_is_given(tmp_path, half_scene):
     # 40 degrees aside, of which the middle is at tan(40) + (tan(70) - tan(40)) / 2 and so on.
     prepared = prepare([path], aside)
     assert prepared.pair.camera.cx_px < 0
-    with pytest.raises(StereoweaveError, match="expected no calibration and no focal length"):
+    with pytest.raises(StereoweaveError, match="and no focal length.*; omit them"):
         prepare([path], Request(focal_px=100.0, baseline_m=0.063))
 
 
@@ -216,7 +217,8 @@ def test_a_panorama_for_one_eye_is_refused_as_such(tmp_path, half_scene):
     Image.fromarray(half_scene.left[:256]).save(path, xmp=xmp)
     assert "expected a stereo picture" in refusal(path)
     assert "found a VR180 picture or a 360-degree panorama" in refusal(path, path)
-    assert refusal(path, path).endswith("or choose the projection (projection)")
+    advice = "give it alone if it holds both eyes, or choose the projection (projection)"
+    assert refusal(path, path).endswith(advice)
 
 
 @pytest.mark.testdata
