@@ -155,9 +155,10 @@ def test_an_error_names_settings_by_their_label(say, text):
     assert say(*ERRORS[text]) == [text]
 
 
+@pytest.mark.parametrize("button", ["video-preview", "video-look"])
 @pytest.mark.parametrize("text", VIDEO_ERRORS)
-def test_a_mistake_with_a_video_is_one_line(say, text):
-    assert say(*VIDEO_ERRORS[text], button="video-preview") == [text]
+def test_a_mistake_with_a_video_is_one_line(say, text, button):
+    assert say(*VIDEO_ERRORS[text], button=button) == [text]
 
 
 @pytest.mark.parametrize("text", NOTES)

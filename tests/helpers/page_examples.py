@@ -58,6 +58,7 @@ _VIDEO_FORM = {
     "video-model": "small",
     "video-output": "depth",
     "video-start": 0,
+    "video-time": 0,
 }
 
 
