@@ -405,7 +405,7 @@ def test_a_guess_is_told_and_how_to_overrule_it(tmp_path, pair):
     assert open_pictures([tmp_path / "view.png"], "side_by_side").notes == ()
 
 
-@pytest.mark.parametrize("format", [*PAIR_LAYOUTS.keys() - INTERLEAVED_LAYOUTS.keys()])
+@pytest.mark.parametrize("format", sorted(PAIR_LAYOUTS.keys() - INTERLEAVED_LAYOUTS.keys()))
 def test_a_named_format_is_taken_without_a_look(tmp_path, rng, format):
     noise = rng.integers(0, 256, (80, 100, 3), dtype=np.uint8)
     write_image(tmp_path / "view.png", noise)
