@@ -16,10 +16,10 @@ from jaxtyping import Float, Float64, UInt8
 from stereoweave.video.motion import match_brightness
 
 # The strongest corner of each cell of this size is tracked, at half size, if it is stronger than noise.
-_CELL_PX, _LEAST_CORNER = 12, 5e-5
+_CELL_PX, _LEAST_CORNER = 14, 5e-5
 _CORNER_PX, _WINDOW_PX, _LEVELS = 5, 13, 4
 _STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 12, 0.02)
-_ROUNDS = 8
+_ROUNDS = 6
 # Corners that are farther off than this multiple of the median do not count; the median is at least the
 # second number of px. A corner follows the camera if it is off by less than the third.
 _TUKEY, _LEAST_SPREAD_PX, _FOLLOWS_PX = 4.0, 0.1, 1.0

@@ -73,11 +73,9 @@ def carry_between(
     if not pairs or before is None or after is None:
         return []
     shares = [number / (len(pairs) + 1) for number in range(1, len(pairs) + 1)]
-    matched = [
-        (frame, find_corners(halve(frame.left_grey), frame.left.disparity_px)) for frame in (before, after)
-    ]
+    corners = find_corners(halve(before.left_grey), before.left.disparity_px)
     with ThreadPoolExecutor(min(threads, len(pairs))) as pool:
-        return list(pool.map(_carry, pairs, repeat(matched), shares))
+        return list(pool.map(_carry, pairs, repeat((before, after)), repeat(corners), shares))
 
 
 def rehearse_carrying() -> None:
@@ -92,15 +90,22 @@ def rehearse_carrying() -> None:
     carry_between([pair], matched[0], matched[1], 1)
 
 
-def _carry(pair: StereoPair, matched: list[tuple[FilteredFrame, TrackedCorners]], share: float) -> Estimate:
-    """Return the estimate of the frame at this share of the time between two matched frames."""
+def _carry(
+    pair: StereoPair, matched: tuple[FilteredFrame, FilteredFrame], corners: TrackedCorners, share: float
+) -> Estimate:
+    """Return the estimate of the frame at this share of the time between two matched frames.
+
+    `corners` are those of the frame before.
+    """
     left, right = convert_to_grey(pair.left), convert_to_grey(pair.right)
-    half = halve(left)
-    cameras = [find_camera_motion(corners, half) for _, corners in matched]
-    of_left = [(frame.left_grey, frame.left) for frame, _ in matched]
-    of_right = [(frame.right_grey, frame.right) for frame, _ in matched]
+    from_before, between = find_camera_motion(corners, halve(left)), matched[1].camera
+    moves = from_before is not None and between is not None
+    cameras = [from_before, from_before @ np.linalg.inv(between) if moves else None]
+    of_left = [(frame.left_grey, frame.left) for frame in matched]
+    of_right = [(frame.right_grey, frame.right) for frame in matched]
     disparity_px, confidence = _carry_view((left, right), -1, of_left, cameras, share)
-    right_disparity_px, _ = _carry_view((right, left), 1, of_right, cameras, share)
+    # To move the right view's points takes as long, and only its own edges gain by it.
+    right_disparity_px, _ = _carry_view((right, left), 1, of_right, (None, None), share)
     return Estimate(
         disparity_px=disparity_px,
         right_disparity_px=right_disparity_px,
@@ -146,7 +151,7 @@ def _find_places(
 ) -> Int32[np.ndarray, "h w"]:
     """Return the index of the pixel of a matched frame that each pixel of a view shows."""
     moved = move_points(camera, track, right)
-    motion = measure_motion(halve(grey), halve(own), moved.path)
+    motion = measure_motion(halve(grey), halve(own), moved.path, paths_only=True)
     places = np.empty(own.shape, np.int32)
     locate(motion, moved.source, places)
     return places

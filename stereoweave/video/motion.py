@@ -101,6 +101,8 @@ def measure_motion(
     before: UInt8[np.ndarray, "h2 w2"],
     grey: UInt8[np.ndarray, "h2 w2"],
     camera_path: CameraPath | None = None,
+    *,
+    paths_only: bool = False,
 ) -> Motion:
     """Measure the motion from a grey image back to the previous image, both at half size.
 
@@ -108,6 +110,7 @@ def measure_motion(
         before: The previous image.
         grey: The image.
         camera_path: Where points would have been if only the camera moved; None if it rests.
+        paths_only: Leave out `calm` and `explained_share`, which only the filter needs.
     """
     before = match_brightness(before, grey)
     flow, least_levels, rests = _find_flow(before, grey)
@@ -115,7 +118,6 @@ def measure_motion(
     allowed_levels: float | Float[np.ndarray, "h2 w2"] = _EXPLAINED * median_levels + _LEAST_LEVELS
     if camera_path is None:
         explained = least_levels <= allowed_levels
-        moves = ~(rests & explained)
     else:
         known = camera_path.known
         camera_levels = _measure_difference_levels(grey, _warp(before, camera_path.to_before_px / 2))
@@ -128,10 +130,15 @@ def measure_motion(
         least_levels = np.where(known, np.minimum(least_levels, camera_levels), least_levels)
         flow[rests] = camera_path.to_before_px[rests] / 2
         explained = least_levels <= allowed_levels
+    if paths_only:
+        return Motion(2 * flow, explained, rests, 1.0, rests)
+    moves = (~(rests & explained)).astype(np.uint8)
+    if camera_path is not None:
         # What the camera uncovers is new, but does not move.
-        moves = cv2.medianBlur((known & ~(rests & explained)).astype(np.uint8), _SPECKLE_PX).astype(bool)
-    calm = cv2.erode((~moves).astype(np.uint8), np.ones((_CALM_PX, _CALM_PX), np.uint8)).astype(bool)
-    return Motion(2 * flow, explained, calm, _measure_explained_share(grey, least_levels, explained), rests)
+        moves = cv2.medianBlur(moves & camera_path.known, _SPECKLE_PX)
+    calm = cv2.erode(1 - moves, np.ones((_CALM_PX, _CALM_PX), np.uint8)).astype(bool)
+    share = _measure_explained_share(grey, least_levels, explained)
+    return Motion(2 * flow, explained, calm, share, rests)
 
 
 def _find_flow(before: UInt8[np.ndarray, "h2 w2"], grey: UInt8[np.ndarray, "h2 w2"]) -> _Flow:

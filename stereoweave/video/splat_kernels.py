@@ -2,6 +2,8 @@
 
 import typing
 
+import numpy as np
+
 from stereoweave.system.jit import kernel
 
 IN_FRONT_PX = 1.0
@@ -33,13 +35,15 @@ def splat(matrix, right, disparity_px, offset_px, nearest_px, source, new_offset
             d = disparity_px[y, x]
             column, row = x + offset_px[y, x, 0] + right * d, y + offset_px[y, x, 1]
             third = matrix[2, 0] * column + matrix[2, 1] * row + matrix[2, 2] + matrix[2, 3] * d
-            there_px = d / third
+            scale = 1.0 / third
+            there_px = d * scale
             to_column = matrix[0, 0] * column + matrix[0, 1] * row + matrix[0, 2] + matrix[0, 3] * d
             to_row = matrix[1, 0] * column + matrix[1, 1] * row + matrix[1, 2] + matrix[1, 3] * d
-            to_column, to_row = to_column / third - right * there_px, to_row / third
+            to_column, to_row = to_column * scale - right * there_px, to_row * scale
             if not (-0.5 < to_column < width - 0.5 and -0.5 < to_row < height - 0.5):
                 continue
-            i, j = int(round(to_row)), int(round(to_column))
+            # Faster than to round.
+            i, j = int(np.floor(to_row + 0.5)), int(np.floor(to_column + 0.5))
             in_front_px = there_px - nearest_px[i, j]
             if in_front_px < -IN_FRONT_PX:
                 continue

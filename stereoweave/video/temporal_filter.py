@@ -42,12 +42,19 @@ _LEAST_ASKED_SHARE = 0.25
 
 
 class FilteredFrame(typing.NamedTuple):
-    """A frame of a video: both views as grey images, uint8 [H, W], and their filtered state."""
+    """A frame of a video.
+
+    Attributes:
+        left_grey, right_grey: Both views as grey images, uint8 [H, W].
+        left, right: Their filtered state.
+        camera: Matrix of the camera's motion from the frame before (`find_camera_motion`), or None.
+    """
 
     left_grey: np.ndarray
     right_grey: np.ndarray
     left: Track
     right: Track
+    camera: np.ndarray | None
 
 
 class Expectation(typing.NamedTuple):
@@ -82,6 +89,7 @@ class TemporalFilter:
         self._threads = min(thread_count(threads), 2)
         self._greys: list[np.ndarray] = []
         self._tracks: list[Track] = []
+        self._camera: np.ndarray | None = None
 
     def __call__(
         self, left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"], estimate: Estimate
@@ -124,7 +132,7 @@ class TemporalFilter:
         if not self._greys:
             return None
         (left_grey, right_grey), (left, right) = self._greys, self._tracks
-        return FilteredFrame(left_grey, right_grey, left, right)
+        return FilteredFrame(left_grey, right_grey, left, right, self._camera)
 
     def replace_left(self, disparity_px: Float32[np.ndarray, "h w"]) -> None:
         """Replace the left disparity of the last frame, with which the next one is filtered."""
@@ -154,8 +162,9 @@ class TemporalFilter:
             return None
         with ThreadPoolExecutor(self._threads) as pool:
             halves, old_halves = [*map(halve, self._greys)], [*map(halve, before)]
-            camera = find_camera_motion(find_corners(old_halves[0], self._tracks[0].disparity_px), halves[0])
-            moved = list(pool.map(partial(move_points, camera), self._tracks, (False, True)))
+            corners = find_corners(old_halves[0], self._tracks[0].disparity_px)
+            self._camera = find_camera_motion(corners, halves[0])
+            moved = list(pool.map(partial(move_points, self._camera), self._tracks, (False, True)))
             paths = [points.path for points in moved]
             motions = list(pool.map(measure_motion, old_halves, halves, paths))
             if np.mean([motion.explained_share for motion in motions]) < CUT_SHARE:
