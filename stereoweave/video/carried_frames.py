@@ -99,8 +99,10 @@ def _carry(
     """
     left, right = convert_to_grey(pair.left), convert_to_grey(pair.right)
     from_before, between = find_camera_motion(corners, halve(left)), matched[1].camera
-    moves = from_before is not None and between is not None
-    cameras = [from_before, from_before @ np.linalg.inv(between) if moves else None]
+    from_after = None
+    if from_before is not None and between is not None:
+        from_after = from_before @ np.linalg.inv(between)
+    cameras = [from_before, from_after]
     of_left = [(frame.left_grey, frame.left) for frame in matched]
     of_right = [(frame.right_grey, frame.right) for frame in matched]
     disparity_px, confidence = _carry_view((left, right), -1, of_left, cameras, share)
