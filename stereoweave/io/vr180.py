@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 
 from stereoweave.errors import FormatError, Remedy
 
-_EXTENSION = b"http://ns.adobe.com/xmp/extension/\0"
+EXTENSION = b"http://ns.adobe.com/xmp/extension/\0"
 _GUID_BYTES = 32
-_HEADER_BYTES = len(_EXTENSION) + _GUID_BYTES + 8
+_HEADER_BYTES = len(EXTENSION) + _GUID_BYTES + 8
 _AGAIN = Remedy("copy or export it again")
 _NUMBERS = (
     "FullPanoWidthPixels",
@@ -111,9 +111,9 @@ def read_right_eye(path: Path, picture: Any, xmp: bytes) -> bytes | None:
 
 def _join_extension(path: Path, picture: Any, xmp: bytes) -> bytes:
     """Return the extended XMP, joined from its segments; empty if there is none."""
-    segments = [content for _, content in getattr(picture, "applist", []) if content.startswith(_EXTENSION)]
+    segments = [content for _, content in getattr(picture, "applist", []) if content.startswith(EXTENSION)]
     named = (_find(xmp, b"xmpNote:HasExtendedXMP") or b"").strip()
-    parts = [(content[len(_EXTENSION) :][:_GUID_BYTES], content) for content in segments]
+    parts = [(content[len(EXTENSION) :][:_GUID_BYTES], content) for content in segments]
     # Some programs change the main XMP, and with it the name of its extension.
     mine = [content for guid, content in parts if guid == named] or segments
     pieces: dict[int, bytes] = {}
