@@ -32,8 +32,8 @@ MISTAKES = {
     "--help",
     "--verion": "no such option: --verion; did you mean --version? See stereoweave --help",
     "bench": "expected a command, found none; see stereoweave bench --help",
-    f"depth {PAIR} --modle best": "no such option: --modle; did you mean --left, --model? See stereoweave "
-    "depth --help",
+    f"depth {PAIR} --modle best": "no such option: --modle; did you mean --left, --model, --whole? See "
+    "stereoweave depth --help",
     f"depth {PAIR} --out": "--out: expected a value, found none; see stereoweave depth --help",
     f"depth {PAIR} --json=yes": "--json: expected no value; see stereoweave depth --help",
     f"depth {PAIR} --jobs 0": "--jobs: expected at least 1, found '0'; see stereoweave depth --help",
