@@ -23,7 +23,8 @@ _ROUNDS = 6
 # Corners that are farther off than this multiple of the median do not count; the median is at least the
 # second number of px. A corner follows the camera if it is off by less than the third.
 _TUKEY, _LEAST_SPREAD_PX, _FOLLOWS_PX = 4.0, 0.1, 1.0
-_LEAST_CORNERS, _LEAST_SHARE = 60, 0.5
+# The fit has 11 unknowns, and each corner gives two equations; a frame of 256x192 has 54 cells.
+_LEAST_CORNERS, _LEAST_SHARE = 40, 0.5
 # Places are in units of the width, disparities in units of a tenth of it, so that one ridge suits all.
 _DISPARITY_UNIT = 0.1
 # Keeps the fit defined where all disparities are equal, as of a picture on a wall.
