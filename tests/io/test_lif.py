@@ -153,6 +153,11 @@ def test_views_of_two_sizes_are_refused(path, eyes):
         b'{"views": [{"image": {"blob_id": 1e999}}, {"image": {"blob_id": -1}}]}',
         b'{"views": [{"image": {"blob_id": -1}, "position": {"x": 0}}]}',
         b'{"views": [{"image": {"blob_id": -1}, "position": [NaN, 0]}, {"image": {"blob_id": -1}}]}',
+        b'{"views": [{"image": {"blob_id": -1}, "position": [1]}, {"image": {"blob_id": -1}}]}',
+        b'{"views": [{"image": {"blob_id": -1}, "position": {"x": 1%s, "y": 0}}]}' % (400 * b"0"),
+        b'{"views": [{"image": {"blob_id": -1}, "frustum_skew": ["wide", 0]}]}',
+        b'{"views": [{"image": {"blob_id": -1}, "frustum_skew": [0]}]}',
+        b'{"views": [{"image": {"blob_id": -1}, "frustum_skew": {"x": 0}}]}',
         b"[" * 100_000,
         b'{"views": "' + b"x" * 1_000_001 + b'"}',
     ],
@@ -204,7 +209,8 @@ def test_a_huge_right_view_is_refused_before_it_is_decoded(path, eyes):
 
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("focal_px", v) for v in (0, -1, 1e300, "wide", None, True)]
+    [("focal_px", v) for v in (0, -1, 1e300, 10**400, "wide", None, True)]
+    + [("focal_ratio_to_width", v) for v in (10**400, -(10**400), float("nan"), "wide", [1])]
     + [("width_px", v) for v in (0, -3, "wide")]
     + [("rotation", None)],
 )
@@ -219,7 +225,7 @@ def test_an_implausible_camera_is_left_out(path, eyes, key, value):
     assert not lens.parallel or key != "rotation"
 
 
-@pytest.mark.parametrize("baseline_mm", [0, -45, 1e300, "45", None, [45]])
+@pytest.mark.parametrize("baseline_mm", [0, -45, 1e300, 10**400, "45", None, [45]])
 def test_an_implausible_baseline_is_left_out(path, eyes, baseline_mm):
     path.write_bytes(new_photo(*eyes, said=describe([-1, 1000001]) | {"baseline_mm": baseline_mm}))
     assert open_pictures([path]).lens.baseline_m is None
