@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from stereoweave.cameras.spherical import RECTILINEAR, Projection, SphereRequest
+from stereoweave.cameras.spherical import Projection, SphereRequest
 from stereoweave.errors import FormatError, Note, Remedy, StereoweaveError
 from stereoweave.io import exif, heif, lif, vr180
 from stereoweave.io.decoding import (
@@ -103,7 +103,7 @@ def open_pictures(
                     "omit this setting, and give the left picture first",
                     setting="format",
                 )
-            panorama = sphere.projection not in (None, RECTILINEAR)
+            panorama = sphere.projection is not None
             return _show_window(str(left), _open_two(left, right, panorama=panorama), sphere)
         case [both]:
             return _show_window(str(both), _open_one(both, format, sphere), sphere)
