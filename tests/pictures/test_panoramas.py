@@ -221,6 +221,24 @@ def test_a_panorama_for_one_eye_is_refused_as_such(tmp_path, half_scene):
     assert refusal(path, path).endswith(advice)
 
 
+def test_two_panoramas_can_be_ordinary_pictures(tmp_path, half_scene):
+    xmp = b'<x GPano:ProjectionType="equirectangular"/>'
+    paths = [tmp_path / f"{eye}.jpg" for eye in ("left", "right")]
+    for path, image in zip(paths, (half_scene.left, half_scene.right), strict=True):
+        Image.fromarray(image).save(path, xmp=xmp)
+    opened = open_pictures(paths, None, SphereRequest(projection="rectilinear"))
+    assert opened.sphere is None and opened.pair.left.shape == (512, 512, 3)
+
+
+def test_an_ordinary_pair_with_damaged_extended_metadata_opens(tmp_path, half_scene):
+    path = tmp_path / "a.jpg"
+    both = np.hstack([half_scene.left, half_scene.right])
+    parts = make_extension(b'<rdf:Description crs:Look="warm"/>', 10_000_000)
+    main = b'<x:xmpmeta xmpNote:HasExtendedXMP="0123456789ABCDEF0123456789ABCDEF"/>'
+    path.write_bytes(make_vr180(both, None, gpano=main, extension=parts))
+    assert open_pictures([path]).layout == "side_by_side"
+
+
 @pytest.mark.testdata
 def test_a_real_360_degree_pair_has_rows_that_match(testdata):
     path = testdata / "consumer" / "walrus-360.top-bottom.jpg"
