@@ -53,6 +53,11 @@ class LifViews(NamedTuple):
     view_count: int
     baseline_m: float | None
 
+    @property
+    def by_side(self) -> dict[str, LifView]:
+        """Return the views by the words left and right."""
+        return {"left": self.left, "right": self.right}
+
     def find_lens(self, width_px: int, height_px: int) -> Lens | None:
         """Return the cameras of views of this size; None if unknown, or if the views are shifted in them."""
         if self.left.skew != self.right.skew:

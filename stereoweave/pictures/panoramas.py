@@ -28,7 +28,7 @@ from stereoweave.cameras.spherical import (
 )
 from stereoweave.errors import FormatError, Note, Remedy, StereoweaveError
 from stereoweave.io import vr180
-from stereoweave.io.decoding import DecodedPicture, decode_embedded
+from stereoweave.io.decoding import DecodedPicture, decode_embedded, measure_embedded
 from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS
 from stereoweave.stereo import StereoPair
 
@@ -162,7 +162,17 @@ def read_right_eye(path: Path, picture: Any, xmp: bytes) -> DecodedPicture | Non
         FormatError: It is missing or damaged.
     """
     content = vr180.read_right_eye(path, picture, xmp)
-    return None if content is None else decode_embedded(f"{path} (right eye)", content)
+    return None if content is None else decode_embedded(_name_right_eye(path), content)
+
+
+def measure_right_eye(path: Path, picture: Any, xmp: bytes) -> tuple[int, int] | None:
+    """Return the size in pixels of what `read_right_eye` returns, without decoding it. Raises FormatError."""
+    content = vr180.read_right_eye(path, picture, xmp)
+    return None if content is None else measure_embedded(_name_right_eye(path), content)
+
+
+def _name_right_eye(path: Path) -> str:
+    return f"{path} (right eye)"
 
 
 def cut_pair(pair: StereoPair, view: SphereView) -> StereoPair:

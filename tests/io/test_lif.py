@@ -9,7 +9,7 @@ from video_examples import TEXTURED, shrunk
 
 from stereoweave.errors import FormatError
 from stereoweave.io.images import read_image
-from stereoweave.pictures.loading import open_pictures, pixel_factor
+from stereoweave.pictures.loading import measure_embedded_views, open_pictures
 from stereoweave.pictures.prepare import Request, prepare
 
 
@@ -48,7 +48,8 @@ def test_a_tablet_photo_holds_both_views(path, eyes):
     ]
     assert opened.lens is None
     with Image.open(path) as picture:
-        assert pixel_factor(path, picture, None) == 2
+        assert measure_embedded_views(path, picture, None) == [(240, 160), (240, 160)]
+        assert measure_embedded_views(path, picture, "side_by_side") == []
 
 
 def test_a_new_photo_holds_its_camera_too(path, eyes):
