@@ -109,7 +109,8 @@ def read_projection(path: Path, xmp: bytes, eye_size_px: tuple[int, int]) -> Pro
     """Return the projection that a picture's XMP states for its image; None if it is no panorama.
 
     Raises:
-        FormatError: See `vr180.read_panorama`; or it lacks the angles, and the image fits no projection.
+        FormatError: See `vr180.read_panorama`; or the angles are impossible; or it lacks them, and the image
+            fits no projection.
     """
     found = vr180.read_panorama(path, xmp)
     if found is None:
@@ -120,7 +121,13 @@ def read_projection(path: Path, xmp: bytes, eye_size_px: tuple[int, int]) -> Pro
     # Of a crop, the middle is straight ahead: the rest is the heading of the camera.
     half_deg = width_deg / 2
     name = HALF if width_deg <= 180 else EQUIRECTANGULAR
-    return Projection(name=name, yaw_deg=(-half_deg, half_deg), pitch_deg=found.pitch_deg)
+    try:
+        return Projection(name=name, yaw_deg=(-half_deg, half_deg), pitch_deg=found.pitch_deg)
+    except StereoweaveError as error:
+        raise FormatError(
+            f"{path}: {error.message}, according to its metadata",
+            remedy=Remedy("choose its projection", ("projection",)),
+        ) from error
 
 
 def guess_projection(name: str, eye_size_px: tuple[int, int]) -> Projection | None:

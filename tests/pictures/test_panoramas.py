@@ -200,7 +200,7 @@ def test_a_damaged_vr180_photo_is_refused_in_one_line(tmp_path, half_scene, name
     path = tmp_path / "a.vr.jpg"
     path.write_bytes(damage(half_scene, case))
     message = refusal(path)
-    assert message.startswith(str(path)) or name == "a sliver"
+    assert message.startswith(str(path))
     assert found in message
 
 
@@ -209,6 +209,22 @@ def test_damaged_angles_do_not_matter_if_the_user_gives_the_projection(tmp_path,
     path.write_bytes(damage(half_scene, {"gpano": {"FullPanoWidthPixels": "wide"}}))
     opened = open_pictures([path], None, SphereRequest(projection="half_equirectangular"))
     assert opened.sphere.projection.yaw_deg == (-90, 90)
+
+
+def test_a_sliver_does_not_matter_if_the_user_gives_the_projection(tmp_path, half_scene):
+    path = tmp_path / "a.vr.jpg"
+    path.write_bytes(damage(half_scene, {"gpano": {"CroppedAreaImageWidthPixels": 1}}))
+    opened = open_pictures([path], None, SphereRequest(projection="equirectangular"))
+    assert opened.sphere.projection.yaw_deg == (-180, 180)
+
+
+def test_the_field_of_view_of_a_lens_is_refused_for_an_equirectangular_file(tmp_path, half_scene):
+    path = tmp_path / "a.vr.jpg"
+    path.write_bytes(make_vr180(half_scene.left, half_scene.right))
+    assert f"expected only for a fisheye, found with {path}, which is half_equirectangular" in refusal(
+        path, lens_fov_deg=190
+    )
+    assert open_pictures([path], None, SphereRequest(projection="fisheye", lens_fov_deg=190)).sphere
 
 
 def test_a_panorama_for_one_eye_is_refused_as_such(tmp_path, half_scene):
