@@ -87,8 +87,9 @@ def _encode_heic(*images: np.ndarray) -> bytes:
 
 def _encode_lif(left: np.ndarray, right: np.ndarray) -> bytes:
     """Return a LIF file: a JPEG, then a table with the right view and the description of both."""
+    camera = {"width_px": 72, "focal_px": 60, "frustum_skew": [0, 0], "rotation": [0, 0, 0]}
     views = [
-        {"image": {"blob_id": number}, "width_px": 72, "focal_px": 60, "position": {"x": x, "y": 0, "z": 0}}
+        {"image": {"blob_id": number}, "position": {"x": x, "y": 0, "z": 0}, **camera}
         for number, x in ((-1, 0.0), (1000001, 1.0))
     ]
     fields = {

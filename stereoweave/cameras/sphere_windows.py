@@ -26,6 +26,9 @@ LEAST_FOV_DEG, MOST_FOV_DEG = 10.0, 150.0
 BLIND_DEG = 75.0
 # Limit of windows on a plane or a cylinder, whose pixels shrink towards 90 degrees.
 _FARTHEST_ASIDE_DEG = 80.0
+# A window costs time and memory by its pixels. The widest window of a VR180 picture of half width has 14
+# times as many as the picture; one of a part of few degrees would have thousands of times as many.
+_MOST_ENLARGED = 16
 # A strip repeats this angle at each end, where both of its ends are blended.
 _OVERLAP_DEG = 15.0
 ALL_ROWS = slice(None)
@@ -217,7 +220,8 @@ def make_window(
         fov_deg: Field of view in degrees, from 10 to 150.
 
     Raises:
-        StereoweaveError: The direction or the field of view is out of range, or the baseline vanishes there.
+        StereoweaveError: The direction or the field of view is out of range, the baseline vanishes there, or
+            the window has no more than 31 pixels a side, or far more pixels than the picture.
     """
     if not LEAST_FOV_DEG <= fov_deg <= MOST_FOV_DEG:
         raise StereoweaveError(
@@ -233,16 +237,17 @@ def make_window(
             setting="look_deg",
         )
     resolution_px = projection.pixels_per_radian(eye_size_px)
-    if projection.turns:
-        return _make_cylinder(yaw, pitch, math.radians(fov_deg), resolution_px)
-    return _make_plane(yaw, pitch, math.radians(fov_deg), resolution_px)
+    make = _make_cylinder if projection.turns else _make_plane
+    window = make(yaw, pitch, math.radians(fov_deg), resolution_px)
+    _check_size(window.size_px, eye_size_px)
+    return window
 
 
 def _make_cylinder(yaw: float, pitch: float, span: float, resolution_px: float) -> CylinderWindow:
     """Return the window of eyes that turn, of `span` by `span` radians around a direction."""
     _check_aside("below or above the level", pitch, span)
     focal_px, height_px, cy_px = _spread(-pitch, span, resolution_px)
-    size_px = _check_size((_even(focal_px * span), height_px))
+    size_px = _even(focal_px * span), height_px
     return CylinderWindow(
         size_px=size_px, focal_px=focal_px, cx_px=(size_px[0] - 1) / 2, cy_px=cy_px, yaw=yaw
     )
@@ -257,7 +262,7 @@ def _make_plane(yaw: float, pitch: float, span: float, resolution_px: float) -> 
     # A plane shows a direction aside at 1 / cosine of the scale of its middle.
     height_px = _even(2 * math.tan(span / 2) / math.cos(aside) * focal_px)
     return PerspectiveWindow(
-        size_px=_check_size((width_px, height_px)),
+        size_px=(width_px, height_px),
         focal_px=focal_px,
         cx_px=cx_px,
         cy_px=(height_px - 1) / 2,
@@ -266,12 +271,17 @@ def _make_plane(yaw: float, pitch: float, span: float, resolution_px: float) -> 
 
 
 def make_whole_window(projection: Projection, eye_size_px: tuple[int, int]) -> Window:
-    """Return the window of all directions of a picture, as sharp as the picture."""
+    """Return the window of all directions of a picture, as sharp as the picture.
+
+    Raises:
+        StereoweaveError: It has no more than 31 pixels a side, or far more pixels than the picture.
+    """
     resolution_px = projection.pixels_per_radian(eye_size_px)
     height_px = _even(math.pi * resolution_px)
     span = math.radians(360 + 2 * _OVERLAP_DEG) if projection.turns else math.pi
     width_px = _even(span * resolution_px)
-    size_px = _check_size((width_px, height_px))
+    size_px = width_px, height_px
+    _check_size(size_px, eye_size_px)
     kind = StripWindow if projection.turns else ArcWindow
     return kind(size_px=size_px, focal_px=resolution_px, cx_px=(width_px - 1) / 2, cy_px=(height_px - 1) / 2)
 
@@ -300,14 +310,20 @@ def _check_aside(where: str, angle: float, span: float) -> None:
         )
 
 
-def _check_size(size_px: tuple[int, int]) -> tuple[int, int]:
+def _check_size(size_px: tuple[int, int], eye_size_px: tuple[int, int]) -> None:
     if min(size_px) < 32 or max(size_px) > LONGEST_SIDE_PX or size_px[0] * size_px[1] > 65_000_000:
         raise StereoweaveError(
             "expected a window of at least 32 pixels a side and at most 65 megapixels, found "
             f"{size_px[0]}x{size_px[1]}",
             remedy=Remedy("choose another field of view", ("fov_deg",)),
         )
-    return size_px
+    if size_px[0] * size_px[1] > _MOST_ENLARGED * eye_size_px[0] * eye_size_px[1]:
+        raise StereoweaveError(
+            f"expected a window of at most {_MOST_ENLARGED} times the picture's pixels, found "
+            f"{size_px[0]}x{size_px[1]} px of a picture of {eye_size_px[0]}x{eye_size_px[1]} px, which shows "
+            "few degrees",
+            remedy=Remedy("choose a narrower field of view", ("fov_deg",)),
+        )
 
 
 def _even(extent_px: float) -> int:

@@ -26,7 +26,7 @@ PROJECTIONS = (RECTILINEAR, EQUIRECTANGULAR, HALF, FISHEYE)
 # A camera of two lenses sees less to both sides; a picture that shows more was taken or rendered with eyes
 # that turn (omnidirectional stereo).
 _WIDEST_FIXED_DEG = 230.0
-_LEAST_LENS_DEG, _MOST_LENS_DEG = 20.0, 280.0
+LEAST_LENS_DEG, MOST_LENS_DEG = 20.0, 280.0
 _LEAST_SPAN_DEG = 1.0
 
 
@@ -62,9 +62,9 @@ class Projection:
             raise StereoweaveError(
                 f"expected an image of 1 to 360 by 1 to 180 degrees, found {spans[0]:g} by {spans[1]:g}"
             )
-        if not _LEAST_LENS_DEG <= self.lens_fov_deg <= _MOST_LENS_DEG:
+        if not LEAST_LENS_DEG <= self.lens_fov_deg <= MOST_LENS_DEG:
             raise StereoweaveError(
-                f"expected a field of view of {_LEAST_LENS_DEG:g} to {_MOST_LENS_DEG:g} degrees, "
+                f"expected a field of view of {LEAST_LENS_DEG:g} to {MOST_LENS_DEG:g} degrees, "
                 f"found {self.lens_fov_deg:g}",
                 setting="lens_fov_deg",
             )
@@ -170,7 +170,7 @@ class SphereRequest:
         """Return the projection of a file; None for an ordinary one.
 
         Raises:
-            StereoweaveError: The other settings need a projection, but none is known.
+            StereoweaveError: The other settings need a projection, but none is known or another one is.
         """
         chosen = detected
         if self.projection == RECTILINEAR:
@@ -178,6 +178,12 @@ class SphereRequest:
         elif self.projection is not None and (detected is None or detected.name != self.projection):
             chosen = Projection.named(self.projection)
         if chosen is not None and self.lens_fov_deg is not None:
+            if chosen.name != FISHEYE:
+                raise StereoweaveError(
+                    f"expected only for a fisheye, found with {name}, which is {chosen.name}",
+                    setting="lens_fov_deg",
+                    remedy=Remedy(f"omit it, or choose {FISHEYE}", ("projection",)),
+                )
             chosen = replace(chosen, lens_fov_deg=self.lens_fov_deg)
         settings = {
             "whole": self.whole or None,

@@ -100,14 +100,6 @@ def read_picture(path: Path, *, panorama: bool = False) -> DecodedPicture:
         return decode(path, picture)
 
 
-def read_embedded_picture(name: str, content: bytes) -> DecodedPicture:
-    """Decode a picture with one view that is part of another file; error messages call it `name`."""
-    with _decoding(name):
-        picture = _open(name, io.BytesIO(content), 1)
-    check_size(name, picture.size)
-    return decode(name, picture)
-
-
 def decode(path: str | Path, picture: Image.Image) -> DecodedPicture:
     """Decode an open picture, or the current frame if it has several."""
     stated_px = picture.size
@@ -137,18 +129,24 @@ def decode_values(path: str | Path, picture: Image.Image) -> Shaped[np.ndarray, 
 
 def decode_packed_values(name: str, content: bytes) -> Shaped[np.ndarray, "h w *channels"]:
     """Decode the stored values of a picture embedded in another file; error messages call it `name`."""
-    with _decoding(name):
-        picture = _open(name, io.BytesIO(content), 1)
-    check_size(name, picture.size)
-    return decode_values(name, picture)
+    return decode_values(name, _open_embedded(name, content))
 
 
 def decode_embedded(name: str, content: bytes) -> DecodedPicture:
     """Decode a picture embedded in another file, with its colours; error messages call it `name`."""
+    return decode(name, _open_embedded(name, content))
+
+
+def measure_embedded(name: str, content: bytes) -> tuple[int, int]:
+    """Return the width and height of a picture embedded in another file, without decoding it."""
+    return _open_embedded(name, content).size
+
+
+def _open_embedded(name: str, content: bytes) -> Image.Image:
     with _decoding(name):
         picture = _open(name, io.BytesIO(content), 1)
     check_size(name, picture.size)
-    return decode(Path(name), picture)
+    return picture
 
 
 def check_regular(path: Path, expected: str) -> None:

@@ -28,9 +28,11 @@ _MOST_BYTES = 500_000_000
 _MOST_META_BYTES = 1_000_000
 _MOST_PICTURES = 20
 _MOST_BOXES = 1000  # on the top level of a file
-_OTHER_ITEMS = frozenset({b"Exif", b"mime", b"uri "})
-# Cameras write the first of these boxes by its identifier, as drafts of the standard did.
-_EXTRINSICS = (bytes.fromhex("4363e9145b7d4aab97aebea69803b434"), b"cmex")
+# Types of items that are no pictures.
+OTHER_ITEMS = frozenset({b"Exif", b"mime", b"uri "})
+# Cameras write this box by its identifier, as drafts of the standard did.
+EXTRINSICS_UUID = bytes.fromhex("4363e9145b7d4aab97aebea69803b434")
+_EXTRINSICS = (EXTRINSICS_UUID, b"cmex")
 # Apple's box: a signed number, ten-thousandths of the picture's width.
 _DISPARITY_ADJUSTMENT = bytes.fromhex("de22508536cb436587432f8705e7c78a")
 
@@ -157,7 +159,7 @@ def _check_meta(path: Path, meta: bytes) -> None:
 def _is_visible_picture(entry: bytes) -> bool:
     """Tell whether an item is a picture that is not hidden, as tiles are, from the content of its `infe`."""
     kind = entry[10:14] if entry[:1] == b"\3" else entry[8:12]  # identifiers of 32 bits, or of 16
-    return len(kind) == 4 and not entry[3] & 1 and kind not in _OTHER_ITEMS
+    return len(kind) == 4 and not entry[3] & 1 and kind not in OTHER_ITEMS
 
 
 def _find_stereo_group(picture: Any) -> dict[str, Any] | None:

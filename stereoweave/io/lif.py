@@ -22,6 +22,7 @@ _END_BYTES = 6  # the table's length and the mark
 _DESCRIPTIONS = (8, 7)  # types of fields, the newer one first
 _THE_FILE = -1
 _LONGEST_BASELINE_M = 10.0
+_MOST = 1e9  # of a number that describes a camera
 _MOST_FIELDS, _MOST_JSON_BYTES, _MOST_BYTES = 1000, 1_000_000, 500_000_000
 
 
@@ -31,13 +32,17 @@ class LifView(NamedTuple):
     Attributes:
         picture: Its encoded picture; None for the JPEG that the file itself is.
         x, y: Place of its camera, in units of `baseline_m`; x increases to the right.
-        said: What the file says about it, by name.
+        skew: Shift of the view in its camera, in x and y; None if the file does not state it.
+        rotation: Rotation of the camera, as the file states it; None if it does not.
+        focal_share: Focal length as a share of the view's width; None if the file does not state it.
     """
 
     picture: bytes | None
     x: float
     y: float
-    said: Mapping[str, Any]
+    skew: tuple[float, ...] | None
+    rotation: Any
+    focal_share: float | None
 
 
 class LifViews(NamedTuple):
@@ -48,17 +53,22 @@ class LifViews(NamedTuple):
     view_count: int
     baseline_m: float | None
 
+    @property
+    def by_side(self) -> dict[str, LifView]:
+        """Return the views by the words left and right."""
+        return {"left": self.left, "right": self.right}
+
     def find_lens(self, width_px: int, height_px: int) -> Lens | None:
         """Return the cameras of views of this size; None if unknown, or if the views are shifted in them."""
-        skews = [_read_numbers(view.said, "frustum_skew", "xy") for view in (self.left, self.right)]
-        turns = [view.said.get("rotation") for view in (self.left, self.right)]
-        if skews[0] != skews[1]:
+        if self.left.skew != self.right.skew:
             return None
         baseline_m = (self.baseline_m or 0) * (self.right.x - self.left.x)
+        share = self.left.focal_share
+        focal_px = None if share is None else share * width_px
         lens = Lens(
-            focal_px=take_plausible_focal_px(_read_focal_px(self.left.said, width_px), width_px, height_px),
+            focal_px=take_plausible_focal_px(focal_px, width_px, height_px),
             baseline_m=baseline_m if 0 < baseline_m < _LONGEST_BASELINE_M else None,
-            parallel=turns[0] is not None and turns[0] == turns[1],
+            parallel=self.left.rotation is not None and self.left.rotation == self.right.rotation,
             source="the LIF file",
         )
         return lens if lens.is_known else None
@@ -91,12 +101,13 @@ def read_lif(path: Path) -> LifViews | None:
             fields = _split_fields(file.read(length))
         said = _read_description(fields)
         views = [_read_view(each, fields, index) for index, each in enumerate(said["views"])]
+        stated_mm = _read_plausible(said.get("baseline_mm"))
     except (
-        KeyError,
+        LookupError,
+        ArithmeticError,
         TypeError,
         ValueError,
         AttributeError,
-        OverflowError,
         RecursionError,
         struct.error,
     ) as error:
@@ -110,10 +121,7 @@ def read_lif(path: Path) -> LifViews | None:
             f"{path}: expected a stereo picture, found a LIF file with one view and its depth map; "
             "take the picture again as 3-D, or give the two pictures it was made from"
         )
-    stated_mm = said.get("baseline_mm")
-    return LifViews(
-        row[0], row[-1], len(views), stated_mm / 1000 if isinstance(stated_mm, int | float) else None
-    )
+    return LifViews(row[0], row[-1], len(views), None if stated_mm is None else stated_mm / 1000)
 
 
 def _find_table(path: Path) -> tuple[int, int] | None:
@@ -169,7 +177,14 @@ def _read_view(said: Mapping[str, Any], fields: Mapping[int, bytes], index: int)
     x, y = (float(value) for value in place)
     if not (math.isfinite(x) and math.isfinite(y)):
         raise ValueError("a view has no place")
-    return LifView(None if number == _THE_FILE else fields[int(number)], x, y, said)
+    return LifView(
+        picture=None if number == _THE_FILE else fields[int(number)],
+        x=x,
+        y=y,
+        skew=_read_numbers(said, "frustum_skew", "xy"),
+        rotation=said.get("rotation"),
+        focal_share=_read_focal_share(said),
+    )
 
 
 def _read_numbers(said: Mapping[str, Any], name: str, axes: str) -> tuple[float, ...] | None:
@@ -182,12 +197,15 @@ def _read_numbers(said: Mapping[str, Any], name: str, axes: str) -> tuple[float,
     return None
 
 
-def _read_focal_px(said: Mapping[str, Any], width_px: int) -> float | None:
-    """Return the focal length at a width of the picture; None if the file does not state it."""
+def _read_focal_share(said: Mapping[str, Any]) -> float | None:
+    """Return the focal length as a share of the width; None if the file does not state a plausible one."""
     ratio = said.get("focal_ratio_to_width")
-    if ratio is None and said.get("width_px") and said.get("focal_px"):
-        try:
-            ratio = float(said["focal_px"]) / float(said["width_px"])
-        except (TypeError, ValueError):
-            return None
-    return float(ratio) * width_px if isinstance(ratio, int | float) else None
+    if ratio is not None:
+        return _read_plausible(ratio)
+    width_px, focal_px = (_read_plausible(said.get(name)) for name in ("width_px", "focal_px"))
+    return focal_px / width_px if focal_px and width_px else None
+
+
+def _read_plausible(value: Any) -> float | None:
+    """Return a number, which the whole numbers of JSON may be too large for; None if it is another value."""
+    return float(value) if isinstance(value, int | float) and abs(value) < _MOST else None

@@ -14,19 +14,18 @@ from jaxtyping import UInt8
 from stereoweave.errors import FormatError, require_extra
 from stereoweave.io.boxes import Box, change_boxes, make_box, split_boxes
 from stereoweave.io.files import replacing
+from stereoweave.io.heif import EXTRINSICS_UUID, OTHER_ITEMS
 from stereoweave.stereo import StereoCamera
 
 _QUALITY = 95
 # Apple writes the camera's properties by the identifiers of a draft of the standard.
 _INTRINSICS = bytes.fromhex("22cc04c7d6d94e079d904eb6ecbaf3a3")
-_EXTRINSICS = bytes.fromhex("4363e9145b7d4aab97aebea69803b434")
 # Intrinsics are shares of the width and the height, with this many bits after the point.
 _SHIFT = 28
 _HAS_X = 1
 _GROUP = 1000  # libheif numbers items from 1 on; groups share their numbers
 _META_HEAD = 4  # version and flags
 _HIDDEN = 1
-_OTHER_ITEMS = frozenset({b"Exif", b"mime", b"uri "})
 _UNKNOWN = "expected a HEIC file of two pictures as libheif writes it, found"
 
 
@@ -100,7 +99,7 @@ def _find_views(parts: dict[bytes, bytes]) -> tuple[int, int]:
     views = [
         int.from_bytes(entry[4:6])
         for entry in entries
-        if entry[:1] == b"\2" and not entry[3] & _HIDDEN and entry[8:12] not in _OTHER_ITEMS
+        if entry[:1] == b"\2" and not entry[3] & _HIDDEN and entry[8:12] not in OTHER_ITEMS
     ]
     if len(views) != 2:
         raise FormatError(f"{_UNKNOWN} {len(views)} pictures")
@@ -115,8 +114,8 @@ def _make_properties(camera: StereoCamera | None, width_px: int) -> tuple[list[b
     focal = round(camera.focal_px / width_px * (1 << _SHIFT))
     intrinsics = make_box(b"uuid", _INTRINSICS + struct.pack(">I3i", _SHIFT << 8, focal, middle, middle))
     x_um = round(1e6 * camera.baseline_m)
-    left = make_box(b"uuid", _EXTRINSICS + bytes(4))
-    right = make_box(b"uuid", _EXTRINSICS + struct.pack(">Ii", _HAS_X, x_um))
+    left = make_box(b"uuid", EXTRINSICS_UUID + bytes(4))
+    right = make_box(b"uuid", EXTRINSICS_UUID + struct.pack(">Ii", _HAS_X, x_um))
     return [intrinsics, left], [intrinsics, right]
 
 

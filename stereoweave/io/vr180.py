@@ -89,7 +89,8 @@ def read_right_eye(path: Path, picture: Any, xmp: bytes) -> bytes | None:
     """Return the file of the right eye's picture in an open JPEG; None if the metadata promises none.
 
     Raises:
-        FormatError: The picture is promised, but missing, incomplete or not in base64.
+        FormatError: The picture is promised, but missing, incomplete or not in base64. Damaged extended
+            metadata of a picture whose main XMP promises none are ignored.
     """
     extended = _join_extension(path, picture, xmp)
     text = _find(extended, b"GImage:Data") or _find(xmp, b"GImage:Data")
@@ -130,6 +131,8 @@ def _join_extension(path: Path, picture: Any, xmp: bytes) -> bytes:
         joined.append(pieces[start])
         end = start + len(pieces[start])
     if end != stated:
+        if b"GImage:" not in xmp:  # an ordinary picture, whose extended metadata do not matter
+            return b""
         raise FormatError(
             f"{path}: expected {stated} bytes of extended metadata with the right eye's picture, found {end} "
             "without a gap",

@@ -10,17 +10,18 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from stereoweave.cameras.spherical import RECTILINEAR, Projection, SphereRequest
+from stereoweave.cameras.spherical import Projection, SphereRequest
 from stereoweave.errors import FormatError, Note, Remedy, StereoweaveError
 from stereoweave.io import exif, heif, lif, vr180
 from stereoweave.io.decoding import (
     DecodedPicture,
     check_size,
     decode,
+    decode_embedded,
     find_view_frames,
     holds_depth,
+    measure_embedded,
     open_picture,
-    read_embedded_picture,
     read_frame,
     read_picture,
 )
@@ -103,7 +104,7 @@ def open_pictures(
                     "omit this setting, and give the left picture first",
                     setting="format",
                 )
-            panorama = sphere.projection not in (None, RECTILINEAR)
+            panorama = sphere.projection is not None
             return _show_window(str(left), _open_two(left, right, panorama=panorama), sphere)
         case [both]:
             return _show_window(str(both), _open_one(both, format, sphere), sphere)
@@ -126,15 +127,37 @@ def _advise_on_count(paths: Sequence[Path]) -> Remedy | None:
 def pixel_factor(path: Path, picture: Image.Image, format: str | None) -> int:
     """Return the ratio, 1 or 2, of the number of pixels in both views to the number in the file's header.
 
-    It is 2 for MPO, HEIC and LIF files with two views, for animations of two frames, and for half-size views
-    declared by `format` or by the file's JPS header.
+    It is 2 for MPO and HEIC files with two views, for animations of two frames, and for half-size views
+    declared by `format` or by the file's JPS header. Of other files, see `measure_embedded_views` first.
     """
-    if format is None and (lif.is_lif(path) or b"GImage:" in vr180.read_xmp(picture)):
-        return 2
     if _find_frames(path, picture, format):
         return 2
     known = PAIR_LAYOUTS.get(_read_declared(path, picture, format)[0] or "")
     return 2 if known is not None and known.half else 1
+
+
+def measure_embedded_views(path: Path, picture: Image.Image, format: str | None) -> list[tuple[int, int]]:
+    """Return the widths and heights of both views of a LIF file or VR180 photo; empty for other files.
+
+    The size of a view that is embedded in the file of an open picture may be any, whatever the picture's.
+
+    Raises:
+        FormatError: The embedded view is missing, is too large for any use, or is no picture.
+    """
+    if format is not None:
+        return []
+    right_px = panoramas.measure_right_eye(path, picture, vr180.read_xmp(picture))
+    if right_px:
+        return [picture.size, right_px]
+    views = lif.read_lif(path)
+    return [
+        picture.size if view.picture is None else measure_embedded(_name_view(path, side), view.picture)
+        for side, view in (views.by_side.items() if views else ())
+    ]
+
+
+def _name_view(path: Path, side: str) -> str:
+    return f"{path}, {side} view"
 
 
 def _find_frames(path: Path, picture: Image.Image, format: str | None) -> list[int]:
@@ -300,8 +323,8 @@ def _open_lif(path: Path, picture: Image.Image, views: lif.LifViews) -> Opened:
     decoded = [
         decode(path, picture)
         if view.picture is None
-        else read_embedded_picture(f"{path}, {side} view", view.picture)
-        for side, view in (("left", views.left), ("right", views.right))
+        else decode_embedded(_name_view(path, side), view.picture)
+        for side, view in views.by_side.items()
     ]
     lies, notes = _choose_orientations(*decoded)
     eyes = [each.upright(lie) for each, lie in zip(decoded, lies, strict=True)]

@@ -28,7 +28,7 @@ from stereoweave.cameras.spherical import (
 )
 from stereoweave.errors import FormatError, Note, Remedy, StereoweaveError
 from stereoweave.io import vr180
-from stereoweave.io.decoding import DecodedPicture, decode_embedded
+from stereoweave.io.decoding import DecodedPicture, decode_embedded, measure_embedded
 from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS
 from stereoweave.stereo import StereoPair
 
@@ -109,7 +109,8 @@ def read_projection(path: Path, xmp: bytes, eye_size_px: tuple[int, int]) -> Pro
     """Return the projection that a picture's XMP states for its image; None if it is no panorama.
 
     Raises:
-        FormatError: See `vr180.read_panorama`; or it lacks the angles, and the image fits no projection.
+        FormatError: See `vr180.read_panorama`; or the angles are impossible; or it lacks them, and the image
+            fits no projection.
     """
     found = vr180.read_panorama(path, xmp)
     if found is None:
@@ -120,7 +121,13 @@ def read_projection(path: Path, xmp: bytes, eye_size_px: tuple[int, int]) -> Pro
     # Of a crop, the middle is straight ahead: the rest is the heading of the camera.
     half_deg = width_deg / 2
     name = HALF if width_deg <= 180 else EQUIRECTANGULAR
-    return Projection(name=name, yaw_deg=(-half_deg, half_deg), pitch_deg=found.pitch_deg)
+    try:
+        return Projection(name=name, yaw_deg=(-half_deg, half_deg), pitch_deg=found.pitch_deg)
+    except StereoweaveError as error:
+        raise FormatError(
+            f"{path}: {error.message}, according to its metadata",
+            remedy=Remedy("choose its projection", ("projection",)),
+        ) from error
 
 
 def guess_projection(name: str, eye_size_px: tuple[int, int]) -> Projection | None:
@@ -162,7 +169,17 @@ def read_right_eye(path: Path, picture: Any, xmp: bytes) -> DecodedPicture | Non
         FormatError: It is missing or damaged.
     """
     content = vr180.read_right_eye(path, picture, xmp)
-    return None if content is None else decode_embedded(f"{path} (right eye)", content)
+    return None if content is None else decode_embedded(_name_right_eye(path), content)
+
+
+def measure_right_eye(path: Path, picture: Any, xmp: bytes) -> tuple[int, int] | None:
+    """Return the size in pixels of what `read_right_eye` returns, without decoding it. Raises FormatError."""
+    content = vr180.read_right_eye(path, picture, xmp)
+    return None if content is None else measure_embedded(_name_right_eye(path), content)
+
+
+def _name_right_eye(path: Path) -> str:
+    return f"{path} (right eye)"
 
 
 def cut_pair(pair: StereoPair, view: SphereView) -> StereoPair:

@@ -21,7 +21,7 @@ from stereoweave.outputs.point_cloud import require_camera
 from stereoweave.outputs.report import Summary
 from stereoweave.outputs.results import FILES, needs_camera
 from stereoweave.outputs.run import Result, run_many
-from stereoweave.pictures.loading import pixel_factor
+from stereoweave.pictures.loading import measure_embedded_views, pixel_factor
 from stereoweave.pictures.prepare import Prepared, Request, prepare
 from stereoweave.rendering.renderer import Renderer, check_position
 
@@ -116,7 +116,13 @@ def check_pixels(job: ServiceJob) -> float:
     views, megapixels = 3 - len(job.pictures), 0.0
     for path in job.pictures:
         with open_picture(path, views=views) as picture:
-            factor = pixel_factor(path, picture, job.request.format) if views == 2 else 1
+            format = job.request.format
+            embedded_px = measure_embedded_views(path, picture, format) if views == 2 else []
+            if embedded_px:
+                most = job.most_megapixels
+                megapixels += sum(_check_megapixels(path, size_px, most) for size_px in embedded_px)
+                continue
+            factor = pixel_factor(path, picture, format) if views == 2 else 1
             megapixels += factor * _check_megapixels(path, picture.size, job.most_megapixels * views / factor)
     return megapixels
 

@@ -2,13 +2,14 @@
 
 from collections.abc import Iterable, Iterator
 from functools import partial
+from itertools import islice
 
 import numpy as np
 from jaxtyping import Float32, UInt8
 
 from stereoweave.errors import FormatError, Note
 from stereoweave.stereo import StereoCamera
-from stereoweave.video.tracks import Shot, Track
+from stereoweave.video.tracks import PictureTrack, Shot, Track
 
 
 class FrameSequence:
@@ -38,8 +39,40 @@ class FrameSequence:
         self.notes = [*track.notes, *(odd if len(track.steps) % 2 else [])]
 
     def shots(self, start: int, first: int = 0) -> Iterator[Shot]:
-        """Yield the pairs of which both frames can be decoded; see `VideoTrack.shots`."""
-        return _pair_shots(self._track.shots(2 * start, 2 * first), right_first=self._right_first)
+        """Yield the pairs of which both frames can be decoded, the first one early enough to bridge gaps.
+
+        It is at or before `start` or `first`, if there is one; see the tracks' `shots`.
+        """
+        if isinstance(self._track, PictureTrack):
+            yield from self._pair(2 * _find_whole_pair(self._track, start))
+            return
+        shots = self._pair(2 * start, 2 * first)
+        opening = next(shots, None)
+        if opening is None or opening.number > first > 0:
+            shots, opening = self._pair(0), None
+        if opening is not None:
+            yield opening
+        yield from shots
+
+    def can_begin(self, most: int) -> bool:
+        """Return whether the first frames that can be decoded, at most this many, hold a pair."""
+        shots = islice(self._track.shots(0), most)
+        return next(_pair_shots(shots, right_first=self._right_first), None) is not None
+
+    def _pair(self, start: int, first: int = 0) -> Iterator[Shot]:
+        return _pair_shots(self._track.shots(start, first), right_first=self._right_first)
+
+
+def _find_whole_pair(track: PictureTrack, start: int) -> int:
+    """Return the number of the last pair at or before `start` of readable pictures; 0 if there is none."""
+    pair = start
+    while pair > 0:
+        numbers = [shot.number for shot in islice(track.shots(2 * pair), 2)]
+        if numbers == [2 * pair, 2 * pair + 1]:
+            break
+        # The first picture is the last readable one at or before the pair's, if there is one.
+        pair = min(pair - 1, numbers[0] // 2) if numbers else 0
+    return pair
 
 
 def _pair_shots(shots: Iterable[Shot], *, right_first: bool) -> Iterator[Shot]:

@@ -23,7 +23,8 @@ from stereoweave.video.packings import FRAME_PACKINGS, FRAME_SEQUENTIAL, TWO_STR
 from stereoweave.video.tracks import Shot, Track, VideoTrack, list_picture_files, open_track
 from stereoweave.video.twin_streams import open_twins
 
-# A spatial video is refused if none of this many images is followed by its second view.
+# A spatial or frame-sequential video is refused if none of this many images is followed by its second
+# view.
 _MOST_ALONE = 300
 
 _REPEATED_LAST, _REPEATED_NEXT = (
@@ -285,6 +286,12 @@ def _open_sequence(track: Track, format: str | None) -> StereoVideo:
     name = format or str(track.declared_packing)
     declared = Note(f"{name}, as the file declares", Remedy("override it if it is wrong", ("format",)))
     frames = FrameSequence(track, right_first=FRAME_SEQUENTIAL[name])
+    if not frames.can_begin(_MOST_ALONE):
+        raise FormatError(
+            f"{track.name}: expected left and right frames in turn, found no left frame that can be decoded "
+            f"together with its right frame among the first {_MOST_ALONE}",
+            remedy=Remedy("copy the video again"),
+        )
     return StereoVideo([frames], name, [] if format else [declared])
 
 

@@ -22,7 +22,7 @@ _UNNAMED = 28, _VIEW_ID, 30, 31
 _STEREO3D_BYTES = 36
 # AVStereo3DView and AVSphericalProjection.
 RIGHT, _UNSPECIFIED_VIEWS = 2, (0, 3)
-_RECTILINEAR = 4
+RECTILINEAR_MAPPING = 4
 # Wider pictures are no perspective views; no lens is so narrow.
 _NARROWEST_DEG, _WIDEST_DEG = 1.0, 150.0
 
@@ -172,7 +172,9 @@ def read_side_data(frame: "av.VideoFrame") -> Any:
 
 
 def _is_panorama(spherical: Any) -> bool:
-    return spherical is not None and bool(np.frombuffer(bytes(spherical), np.int32, 1)[0] != _RECTILINEAR)
+    return spherical is not None and bool(
+        np.frombuffer(bytes(spherical), np.int32, 1)[0] != RECTILINEAR_MAPPING
+    )
 
 
 def _filtered(frame: "av.VideoFrame", *steps: str) -> list["av.VideoFrame"]:

@@ -9,15 +9,22 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from stereoweave.cameras.spherical import EQUIRECTANGULAR, FISHEYE, HALF, Projection
+from stereoweave.cameras.spherical import (
+    EQUIRECTANGULAR,
+    FISHEYE,
+    HALF,
+    LEAST_LENS_DEG,
+    MOST_LENS_DEG,
+    Projection,
+)
 from stereoweave.errors import FormatError, StereoweaveError
-from stereoweave.video.spatial import Stereo3D, parse_stereo3d, read_side_data
+from stereoweave.video.spatial import RECTILINEAR_MAPPING, Stereo3D, parse_stereo3d, read_side_data
 
 if TYPE_CHECKING:
     import av
 
-# FFmpeg's AVSphericalProjection; cubemaps are 1, parametric ones 6.
-_TILE, _RECTILINEAR = 2, 4
+# FFmpeg's AVSphericalProjection; cubemaps are 1, ordinary videos 4, parametric ones 6.
+_TILE = 2
 _NAMES = {0: EQUIRECTANGULAR, _TILE: EQUIRECTANGULAR, 3: HALF, 5: FISHEYE}
 _KINDS = {1: "a cubemap", 6: "Apple's parametric projection of immersive video"}
 # AVSphericalMapping: projection, yaw, pitch, roll, and the bounds in 0.32 bits: left, top, right, bottom.
@@ -44,7 +51,7 @@ def read_sphere(name: str, frame: "av.VideoFrame") -> SphereMark | None:
     if len(content) < _MAPPING_BYTES:
         return None
     kind = int(np.frombuffer(content, np.int32, 1)[0])
-    if kind == _RECTILINEAR:
+    if kind == RECTILINEAR_MAPPING:
         return None
     if kind not in _NAMES:
         raise FormatError(
@@ -74,8 +81,9 @@ def read_sphere(name: str, frame: "av.VideoFrame") -> SphereMark | None:
 
 
 def _name_projection(video: str, kind: str, lens_fov_deg: float) -> Projection:
-    if not math.isfinite(lens_fov_deg) or not 20 <= lens_fov_deg <= 280:
+    if not math.isfinite(lens_fov_deg) or not LEAST_LENS_DEG <= lens_fov_deg <= MOST_LENS_DEG:
         raise FormatError(
-            f"{video}: expected a fisheye of 20 to 280 degrees, found {lens_fov_deg:g}; its marks are damaged"
+            f"{video}: expected a fisheye of {LEAST_LENS_DEG:g} to {MOST_LENS_DEG:g} degrees, found "
+            f"{lens_fov_deg:g}; its marks are damaged"
         )
     return Projection.named(kind, lens_fov_deg)

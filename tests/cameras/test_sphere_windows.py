@@ -224,3 +224,27 @@ def test_settings_of_a_sphere_need_a_projection():
         SphereRequest(projection="fisheye", lens_fov_deg=500).choose("a.jpg", None)
     assert SphereRequest(projection="rectilinear").choose("a.jpg", HALF) is None
     assert SphereRequest().choose("a.jpg", HALF) is HALF
+
+
+@pytest.mark.parametrize(
+    ("projection", "eye_size_px"),
+    [
+        (Projection(name="half_equirectangular", yaw_deg=(-0.5, 0.5), pitch_deg=(-0.5, 0.5)), (64, 64)),
+        (Projection(name="half_equirectangular", yaw_deg=(-0.5, 0.5)), (64, 64)),
+        (Projection(name="equirectangular", pitch_deg=(-0.5, 0.5)), (128, 64)),
+        (Projection.named("fisheye", 20.0), (200, 200)),
+    ],
+)
+def test_a_part_of_few_degrees_opens_no_window_of_far_more_pixels(projection, eye_size_px):
+    # 64 px a degree are 3667 px a radian, and 90 degrees are two focal lengths wide.
+    with pytest.raises(StereoweaveError, match="at most 16 times the picture's pixels, found") as error:
+        make_window(projection, eye_size_px, (0, 0), 90)
+    assert str(error.value).endswith("; choose a narrower field of view (fov_deg)")
+    with pytest.raises(StereoweaveError, match="at most 16 times the picture's pixels, found|65 megapixels"):
+        make_whole_window(projection, eye_size_px)
+
+
+def test_the_widest_window_of_a_vr180_picture_of_half_width_is_allowed():
+    window = make_window(HALF, (200, 400), (5, 0), 150)
+    # 127 px of focal length: tan 80 + tan 70 wide, and 2 tan 75 / cos 5 high.
+    assert window.size_px == (1072, 954)

@@ -9,7 +9,7 @@ from video_examples import TEXTURED, shrunk
 
 from stereoweave.errors import FormatError
 from stereoweave.io.images import read_image
-from stereoweave.pictures.loading import open_pictures, pixel_factor
+from stereoweave.pictures.loading import measure_embedded_views, open_pictures
 from stereoweave.pictures.prepare import Request, prepare
 
 
@@ -48,7 +48,8 @@ def test_a_tablet_photo_holds_both_views(path, eyes):
     ]
     assert opened.lens is None
     with Image.open(path) as picture:
-        assert pixel_factor(path, picture, None) == 2
+        assert measure_embedded_views(path, picture, None) == [(240, 160), (240, 160)]
+        assert measure_embedded_views(path, picture, "side_by_side") == []
 
 
 def test_a_new_photo_holds_its_camera_too(path, eyes):
@@ -153,6 +154,11 @@ def test_views_of_two_sizes_are_refused(path, eyes):
         b'{"views": [{"image": {"blob_id": 1e999}}, {"image": {"blob_id": -1}}]}',
         b'{"views": [{"image": {"blob_id": -1}, "position": {"x": 0}}]}',
         b'{"views": [{"image": {"blob_id": -1}, "position": [NaN, 0]}, {"image": {"blob_id": -1}}]}',
+        b'{"views": [{"image": {"blob_id": -1}, "position": [1]}, {"image": {"blob_id": -1}}]}',
+        b'{"views": [{"image": {"blob_id": -1}, "position": {"x": 1%s, "y": 0}}]}' % (400 * b"0"),
+        b'{"views": [{"image": {"blob_id": -1}, "frustum_skew": ["wide", 0]}]}',
+        b'{"views": [{"image": {"blob_id": -1}, "frustum_skew": [0]}]}',
+        b'{"views": [{"image": {"blob_id": -1}, "frustum_skew": {"x": 0}}]}',
         b"[" * 100_000,
         b'{"views": "' + b"x" * 1_000_001 + b'"}',
     ],
@@ -204,7 +210,8 @@ def test_a_huge_right_view_is_refused_before_it_is_decoded(path, eyes):
 
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("focal_px", v) for v in (0, -1, 1e300, "wide", None, True)]
+    [("focal_px", v) for v in (0, -1, 1e300, 10**400, "wide", None, True)]
+    + [("focal_ratio_to_width", v) for v in (10**400, -(10**400), float("nan"), "wide", [1])]
     + [("width_px", v) for v in (0, -3, "wide")]
     + [("rotation", None)],
 )
@@ -219,7 +226,7 @@ def test_an_implausible_camera_is_left_out(path, eyes, key, value):
     assert not lens.parallel or key != "rotation"
 
 
-@pytest.mark.parametrize("baseline_mm", [0, -45, 1e300, "45", None, [45]])
+@pytest.mark.parametrize("baseline_mm", [0, -45, 1e300, 10**400, "45", None, [45]])
 def test_an_implausible_baseline_is_left_out(path, eyes, baseline_mm):
     path.write_bytes(new_photo(*eyes, said=describe([-1, 1000001]) | {"baseline_mm": baseline_mm}))
     assert open_pictures([path]).lens.baseline_m is None

@@ -200,7 +200,7 @@ def test_a_damaged_vr180_photo_is_refused_in_one_line(tmp_path, half_scene, name
     path = tmp_path / "a.vr.jpg"
     path.write_bytes(damage(half_scene, case))
     message = refusal(path)
-    assert message.startswith(str(path)) or name == "a sliver"
+    assert message.startswith(str(path))
     assert found in message
 
 
@@ -211,6 +211,22 @@ def test_damaged_angles_do_not_matter_if_the_user_gives_the_projection(tmp_path,
     assert opened.sphere.projection.yaw_deg == (-90, 90)
 
 
+def test_a_sliver_does_not_matter_if_the_user_gives_the_projection(tmp_path, half_scene):
+    path = tmp_path / "a.vr.jpg"
+    path.write_bytes(damage(half_scene, {"gpano": {"CroppedAreaImageWidthPixels": 1}}))
+    opened = open_pictures([path], None, SphereRequest(projection="equirectangular"))
+    assert opened.sphere.projection.yaw_deg == (-180, 180)
+
+
+def test_the_field_of_view_of_a_lens_is_refused_for_an_equirectangular_file(tmp_path, half_scene):
+    path = tmp_path / "a.vr.jpg"
+    path.write_bytes(make_vr180(half_scene.left, half_scene.right))
+    assert f"expected only for a fisheye, found with {path}, which is half_equirectangular" in refusal(
+        path, lens_fov_deg=190
+    )
+    assert open_pictures([path], None, SphereRequest(projection="fisheye", lens_fov_deg=190)).sphere
+
+
 def test_a_panorama_for_one_eye_is_refused_as_such(tmp_path, half_scene):
     path = tmp_path / "a.jpg"
     xmp = b'<x GPano:ProjectionType="equirectangular"/>'
@@ -219,6 +235,24 @@ def test_a_panorama_for_one_eye_is_refused_as_such(tmp_path, half_scene):
     assert "found a VR180 picture or a 360-degree panorama" in refusal(path, path)
     advice = "give it alone if it holds both eyes, or choose the projection (projection)"
     assert refusal(path, path).endswith(advice)
+
+
+def test_two_panoramas_can_be_ordinary_pictures(tmp_path, half_scene):
+    xmp = b'<x GPano:ProjectionType="equirectangular"/>'
+    paths = [tmp_path / f"{eye}.jpg" for eye in ("left", "right")]
+    for path, image in zip(paths, (half_scene.left, half_scene.right), strict=True):
+        Image.fromarray(image).save(path, xmp=xmp)
+    opened = open_pictures(paths, None, SphereRequest(projection="rectilinear"))
+    assert opened.sphere is None and opened.pair.left.shape == (512, 512, 3)
+
+
+def test_an_ordinary_pair_with_damaged_extended_metadata_opens(tmp_path, half_scene):
+    path = tmp_path / "a.jpg"
+    both = np.hstack([half_scene.left, half_scene.right])
+    parts = make_extension(b'<rdf:Description crs:Look="warm"/>', 10_000_000)
+    main = b'<x:xmpmeta xmpNote:HasExtendedXMP="0123456789ABCDEF0123456789ABCDEF"/>'
+    path.write_bytes(make_vr180(both, None, gpano=main, extension=parts))
+    assert open_pictures([path]).layout == "side_by_side"
 
 
 @pytest.mark.testdata

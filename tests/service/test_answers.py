@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 from heic_examples import write_heic
+from lif_examples import tablet_photo
 from PIL import Image
 from service_examples import BOTH, TEXTURED
+from vr180_examples import make_vr180
 
 import stereoweave as sw
 from stereoweave.io.images import read_pair, write_image
@@ -127,3 +129,15 @@ def test_both_pictures_of_one_file_are_measured(photos, tmp_path):
     assert check_pixels(both) == 2 * 640 * 480 / 1e6
     with pytest.raises(TooLargeError, match=r"expected at most 0\.3 megapixels, found 640x480"):
         check_pixels(replace(both, most_megapixels=0.3))
+
+
+@pytest.mark.parametrize("pack", [make_vr180, tablet_photo])
+def test_views_embedded_in_a_picture_are_measured_by_their_own_headers(photos, tmp_path, pack):
+    left, right = photos
+    path = tmp_path / "both.jpg"
+    job = ServiceJob(folder=tmp_path, pictures=(path,), file="disparity.npy", most_megapixels=0.31)
+    path.write_bytes(pack(left, right))
+    assert check_pixels(job) == 2 * 640 * 480 / 1e6
+    path.write_bytes(pack(left, np.tile(right, (2, 2, 1))))
+    with pytest.raises(TooLargeError, match=r"expected at most 0\.31 megapixels, found 1280x960"):
+        check_pixels(job)

@@ -133,6 +133,24 @@ def test_each_frame_packing_has_one_with_the_eyes_swapped_unless_it_has_no_name(
     assert find_swapped_packing(None) is None
 
 
+@pytest.mark.parametrize("missing", [(6,), (7,), (6, 8), (7, 9), (4, 6, 7, 9)])
+def test_pictures_are_read_from_the_middle_as_from_the_start(tmp_path, missing):
+    pairs = flat_pairs(6)
+    for number, image in enumerate(in_turn(pairs)):
+        write_image(tmp_path / f"{number:02}.png", image)
+    for number in missing:
+        (tmp_path / f"{number:02}.png").write_bytes(b"damaged")
+    video = open_video([tmp_path], "frame_sequential")
+    whole = list(video.frames())
+    for start in range(6):
+        frames = list(video.frames(start))
+        assert len(frames) == 6 - start
+        for found, taken in zip(frames, whole[start:], strict=True):
+            np.testing.assert_array_equal(found.left, taken.left)
+            np.testing.assert_array_equal(found.right, taken.right)
+            assert found.problem == taken.problem
+
+
 # Damaged and odd files
 
 
@@ -188,3 +206,29 @@ def test_a_frame_sequence_declared_of_a_single_view_is_one_frame(tmp_path):
         matroska([video_track(1, (160, 96), stereo_mode=13)], [block(1, 0, example_pairs(1)[0][0])])
     )
     assert "found a video of one frame" in refusal(path, None)
+
+
+def test_a_film_without_any_whole_pair_is_refused(tmp_path):
+    path = write_video(tmp_path / "a.avi", in_turn(example_pairs(3)), codec="mjpeg")
+    for frame in (1, 3, 5):
+        damage(path, frame, length=400)
+    assert "found no left frame that can be decoded together with its right frame" in refusal(path)
+
+
+def test_pictures_without_any_whole_pair_are_refused(tmp_path):
+    for number, image in enumerate(in_turn(flat_pairs(3))):
+        write_image(tmp_path / f"{number:02}.png", image)
+        if number % 2 == 0:
+            (tmp_path / f"{number:02}.png").write_bytes(b"damaged")
+    assert "found no left frame that can be decoded together with its right frame" in refusal(tmp_path)
+
+
+def test_an_excerpt_without_any_whole_pair_shows_the_pair_before_it(tmp_path):
+    path = write_video(tmp_path / "a.avi", in_turn(example_pairs(5)), codec="mjpeg")
+    for frame in (5, 7, 9):
+        damage(path, frame, length=400)
+    video = open_video([path], "frame_sequential")
+    whole, part = list(video.frames()), list(video.excerpt(0.2, 1).frames())
+    assert (len(whole), len(part)) == (5, 2)
+    for found, taken in zip(part, whole[3:], strict=True):
+        np.testing.assert_array_equal(found.left, taken.left)
