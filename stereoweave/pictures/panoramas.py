@@ -44,25 +44,36 @@ _WORDS_IN_NAMES = {
 }
 _ASPECT_TOLERANCE = 0.01
 _DEFAULT_FOV_DEG = 90.0
+NO_SPHERE: dict[str, object] = dict.fromkeys(("projection", "look_deg", "fov_deg", "lens_fov_deg", "whole"))
+"""`SphereView.settings` of an ordinary file."""
 
 
 class SphereView(NamedTuple):
-    """What is shown of a VR180 or 360-degree file: a window of both eyes' images, and their projection."""
+    """What is shown of a VR180 or 360-degree file: a window of both eyes' images, and their projection.
+
+    `settings` are those that lead to it, by keyword, as JSON values; defaults are filled in.
+    """
 
     window: Window
     projection: Projection
     eye_size_px: tuple[int, int]
+    settings: dict[str, object]
 
     @classmethod
     def chosen(
         cls, projection: Projection, eye_size_px: tuple[int, int], request: SphereRequest
     ) -> "SphereView":
         """Return the view that the user asks for. Raises StereoweaveError if there is none."""
+        settings: dict[str, object] = NO_SPHERE | {"projection": projection.name}
+        if projection.name == FISHEYE:
+            settings["lens_fov_deg"] = projection.lens_fov_deg
         if request.whole:
-            return cls(make_whole_window(projection, eye_size_px), projection, eye_size_px)
+            window = make_whole_window(projection, eye_size_px)
+            return cls(window, projection, eye_size_px, settings | {"whole": True})
         look_deg = request.look_deg or (0.0, 0.0)
         fov_deg = _DEFAULT_FOV_DEG if request.fov_deg is None else request.fov_deg
-        return cls(make_window(projection, eye_size_px, look_deg, fov_deg), projection, eye_size_px)
+        settings |= {"look_deg": "{:.15g},{:.15g}".format(*look_deg), "fov_deg": fov_deg}
+        return cls(make_window(projection, eye_size_px, look_deg, fov_deg), projection, eye_size_px, settings)
 
     def cutter(self) -> Cutter:
         """Return the cutter of both eyes' images."""

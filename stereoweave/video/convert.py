@@ -15,6 +15,7 @@ from rich.progress import Progress
 from stereoweave import __version__
 from stereoweave.errors import Remedy, StereoweaveError
 from stereoweave.io.output_lock import lock_output
+from stereoweave.pictures.panoramas import NO_SPHERE
 from stereoweave.rendering.rehearsals import rehearse_drawing, rehearse_filling, rehearse_fine_drawing
 from stereoweave.system.compiling_ahead import Rehearsal, compile_ahead
 from stereoweave.system.progress import progress
@@ -222,7 +223,7 @@ def _list_settings(job: VideoJob, video: StereoVideo, sources: Sequence[Path]) -
         "model": _identify_source(model) if model.exists() else str(job.backend.model),
         "film": [_identify_source(source) for source in sources],
         "stereoweave": __version__,
-        **({"projection": str(video.sphere)} if video.sphere else {}),
+        **(video.sphere.settings if video.sphere else NO_SPHERE),
     }
 
 

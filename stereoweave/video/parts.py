@@ -112,7 +112,8 @@ def _check_settings(folder: Path, settings: Mapping[str, object], name_of: NameO
     file = _settings_file(folder)
     with _reporting_damage(file):
         found = dict(json.loads(file.read_text()))
-    other = [name for name, value in json.loads(json.dumps(settings)).items() if value != found.get(name)]
+    current = json.loads(json.dumps(settings))
+    other = [name for name in current | found if current.get(name) != found.get(name)]
     if other:
         begun = ", ".join(_format_setting(name_of(name) or name, found.get(name)) for name in other)
         raise StereoweaveError(

@@ -80,6 +80,15 @@ def test_parts_of_another_video_are_not_continued(tmp_path):
     assert json.loads((tmp_path / "video.mp4.parts" / "settings.json").read_text())["position"] == 0.5
 
 
+def test_parts_made_with_a_setting_that_is_now_unset_are_not_continued(tmp_path):
+    begin(tmp_path / "video.mp4", {"position": 0.5, "look": "30,0"})
+    with (
+        pytest.raises(StereoweaveError, match=r"found parts made with look 30,0; remove this folder"),
+        open_parts(tmp_path / "video.mp4", {"position": 0.5}),
+    ):
+        pass
+
+
 @pytest.mark.parametrize("name", ["settings.json", "state-000001.npz"])
 @pytest.mark.parametrize("content", [b"", b"[1, 2", b"PK\x03\x04 no archive"])
 def test_the_remedy_for_damaged_parts_is_to_remove_their_folder(tmp_path, name, content):

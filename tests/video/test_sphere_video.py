@@ -5,6 +5,7 @@ import av
 import cv2
 import numpy as np
 import pytest
+from rich.console import Console
 from spatial_examples import box, psnr_db
 from sphere_scenes import look_equirectangular, look_fisheye, render_fixed, render_turning
 from video_examples import write_side_by_side
@@ -13,6 +14,9 @@ from stereoweave.cameras.alignment import check_pair
 from stereoweave.cameras.spherical import Projection, SphereRequest
 from stereoweave.cli.root import main
 from stereoweave.errors import StereoweaveError
+from stereoweave.matching.backend import Backend
+from stereoweave.video.convert import convert_video
+from stereoweave.video.job import VideoJob
 from stereoweave.video.mp4_marks import VideoMarks, write_marks
 from stereoweave.video.reader import open_video
 
@@ -180,6 +184,41 @@ def test_what_the_whole_cannot_show_is_refused_in_one_line(tmp_path, half_scene,
     assert run("video", film, "--whole", *words, "-o", tmp_path / "b.mkv") != 0
     error = capsys.readouterr().err.strip().splitlines()[-1]
     assert said in error
+
+
+def stop_after_a_part(film, out, **sphere):
+    """Convert the left views of a film of 0.8 s a frame until the sixth, and leave a part of five frames."""
+    video = open_video([film], "side_by_side", sphere=SphereRequest(**sphere))
+
+    def stop(number):
+        if number == 6 and any(out.parent.glob("*.parts/*.nut")):
+            raise StereoweaveError("stopped")
+
+    video.on_frame = stop
+    job = VideoJob(position=0, backend=Backend(threads=1))
+    with pytest.raises(StereoweaveError, match="stopped"):
+        convert_video(video, [film], out, job, Console(quiet=True))
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (
+            ["--projection", "rectilinear"],
+            "made with --projection half_equirectangular, with --look 5,0, with --fov 60.0; remove",
+        ),
+        (["--look", "5,1", "--fov", 60], "made with --look 5,0; remove"),
+        (["--look", "5,0"], "made with --fov 60.0; remove"),
+        (["--whole"], ", with --look 5,0, with --fov 60.0, without --whole; remove"),
+    ],
+)
+def test_a_conversion_of_another_window_is_not_resumed(tmp_path, half_scene, capsys, words, said):
+    film = write_film(tmp_path / "a.mp4", half_scene, marks=VR180, count=7, times_ms=range(0, 5600, 800))
+    stop_after_a_part(film, tmp_path / "b.mp4", look_deg=(5.0, 0.0), fov_deg=60.0)
+    given = ["--position", 0, "--format", "side_by_side", "--threads", 1]
+    assert run("video", film, *given, *words, "-o", tmp_path / "b.mp4") != 0
+    [line] = [line for line in capsys.readouterr().err.splitlines() if line.startswith("stereoweave")]
+    assert said in line
 
 
 def sv3d(projection):
