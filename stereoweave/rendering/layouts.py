@@ -22,6 +22,7 @@ from stereoweave.io.colormap import find_colour_range_px
 from stereoweave.io.files import replacing
 from stereoweave.io.images import checking_format_size, picture_kind, write_image
 from stereoweave.io.spatial_photos import write_spatial_photo
+from stereoweave.io.vr180_photos import is_vr180_name
 from stereoweave.rendering.floating_windows import cut_windows
 from stereoweave.rendering.renderer import Renderer, check_position
 from stereoweave.stereo import Estimate, StereoCamera, StereoPair
@@ -347,10 +348,10 @@ def add_mark(path: str | Path, name: str, pair: StereoPair, choices: LayoutOptio
     """Return a path whose file name ends in the suffix by which viewers detect the layout.
 
     A quilt's suffix gives the numbers of columns and rows and the aspect ratio of one view, as in
-    view_qs8x6a0.75.png. An .mpo, .heic or .jps file needs no suffix.
+    view_qs8x6a0.75.png. An .mpo, .heic or .jps file and a VR180 photo need no suffix.
     """
     path = Path(path)
-    if path.suffix.lower() in _LAYOUT_BY_ENDING:
+    if path.suffix.lower() in _LAYOUT_BY_ENDING or is_vr180_name(path):
         return path
     height, width = pair.left.shape[:2]
     aspect = round(width / height, 3)

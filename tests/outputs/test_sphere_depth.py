@@ -8,8 +8,9 @@ from sphere_scenes import cast, look_equirectangular, render_fixed, render_turni
 
 from stereoweave.cameras.sphere_merge import MatchedWindow, merge_windows
 from stereoweave.cameras.sphere_windows import make_whole_window, make_window
-from stereoweave.cameras.spherical import Projection
+from stereoweave.cameras.spherical import Projection, SphereRequest
 from stereoweave.cli.root import main
+from stereoweave.pictures.loading import open_pictures
 
 HALF = Projection.named("half_equirectangular")
 FULL = Projection.named("equirectangular")
@@ -122,6 +123,23 @@ def test_views_of_the_whole_are_vr180_again(tmp_path):
     inner = np.s_[50:206, 50:206]
     error = np.abs(middle - expected)[inner].mean()
     assert error < 0.5 * np.abs(left.astype(float) - expected)[inner].mean()
+
+
+def test_a_vr180_photo_is_written_and_opened_again(tmp_path):
+    scene = render_fixed(look_equirectangular((256, 256)))
+    left, right = (cv2.GaussianBlur(eye, (0, 0), 2) for eye in (scene.left, scene.right))
+    path = save(tmp_path / "a_180.png", left, right)
+    words = path, "--whole", "--format", "side_by_side", "--model", "small"
+    out = tmp_path / "again.vr.jpg"
+    assert run("view", *words, "--layout", "top_bottom", "-o", out) == 2
+    assert not out.exists()
+    assert run("view", *words, "--layout", "side_by_side", "-o", out) == 0
+    opened = open_pictures([out], sphere=SphereRequest(whole=True))
+    assert opened.projection is not None and opened.projection.yaw_deg == HALF.yaw_deg
+    before = open_pictures([path], "side_by_side", SphereRequest(projection=HALF.name, whole=True))
+    for name in ("left", "right"):
+        eyes = [getattr(pictures.pair, name).astype(int) for pictures in (opened, before)]
+        assert np.abs(eyes[0] - eyes[1]).mean() < 2
 
 
 @pytest.mark.parametrize(
