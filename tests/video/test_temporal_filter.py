@@ -203,7 +203,7 @@ def test_a_pan_is_filtered_along_its_motion(rng):
 
 def test_a_cut_restarts_the_filter(rng):
     before = at_rest(rng, [plain(10)] * 3)
-    after = at_rest(rng, [plain(10, 10.5), plain(10, 10.5)])
+    after = at_rest(rng, [estimate(*(10 + rng.normal(0, 0.3, (2, HEIGHT, WIDTH))))])
     found = filter_all(before + after)[0]
     assert_unchanged(found[3], after[0])
 
