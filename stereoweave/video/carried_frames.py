@@ -88,6 +88,8 @@ def rehearse_carrying() -> None:
         temporal_filter(pair.left, pair.right, estimate)
         matched.append(temporal_filter.last)
     carry_between([pair], matched[0], matched[1], 1)
+    # The camera rests here, so that nothing has moved its points.
+    move_points(np.eye(4), Track(px, px, px, np.zeros((32, 32, 2), np.float32), px, px), right=False)
 
 
 def _carry(
@@ -102,10 +104,9 @@ def _carry(
     from_after = None
     if from_before is not None and between is not None:
         from_after = from_before @ np.linalg.inv(between)
-    cameras = [from_before, from_after]
     of_left = [(frame.left_grey, frame.left) for frame in matched]
     of_right = [(frame.right_grey, frame.right) for frame in matched]
-    disparity_px, confidence = _carry_view((left, right), -1, of_left, cameras, share)
+    disparity_px, confidence = _carry_view((left, right), -1, of_left, (from_before, from_after), share)
     # To move the right view's points takes as long, and only its own edges gain by it.
     right_disparity_px, _ = _carry_view((right, left), 1, of_right, (None, None), share)
     return Estimate(

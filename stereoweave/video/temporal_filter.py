@@ -77,15 +77,11 @@ class TemporalFilter:
     Args:
         threads: Number of threads; at most two are used, one per view. Default: all cores.
 
-    Attributes:
-        cuts: Number of cuts so far.
-
     Raises:
         StereoweaveError: `threads` is out of range.
     """
 
     def __init__(self, threads: int | None = None) -> None:
-        self.cuts = 0
         self._threads = min(thread_count(threads), 2)
         self._greys: list[np.ndarray] = []
         self._tracks: list[Track] = []
@@ -115,8 +111,6 @@ class TemporalFilter:
         disparities_px = (estimate.disparity_px, estimate.right_disparity_px)
         new_tracks = [_begin_track(*maps) for maps in zip(disparities_px, confidences, strict=True)]
         continued = self._filter_tracks(before, new_tracks) if before else None
-        if before and continued is None:
-            self.cuts += 1
         self._tracks = continued or new_tracks
         filtered, filtered_right = self._tracks
         return Estimate(
@@ -140,7 +134,7 @@ class TemporalFilter:
 
     def state(self) -> dict[str, np.ndarray]:
         """Return the complete state as arrays for `np.savez`; a restored filter gives the same results."""
-        kept = {"cuts": np.array(self.cuts)}
+        kept = {}
         for side, grey, track in zip(("left", "right"), self._greys, self._tracks, strict=False):
             kept[f"{side}_grey"] = grey
             kept |= {f"{side}_{name}": values for name, values in track._asdict().items()}
@@ -150,7 +144,6 @@ class TemporalFilter:
     def from_state(cls, state: Mapping[str, np.ndarray], threads: int | None = None) -> "TemporalFilter":
         """Restore a filter from a saved `state`."""
         temporal_filter = cls(threads)
-        temporal_filter.cuts = int(state["cuts"])
         for side in ("left", "right") if "left_grey" in state else ():
             temporal_filter._greys.append(state[f"{side}_grey"])
             temporal_filter._tracks.append(Track(*(state[f"{side}_{name}"] for name in Track._fields)))

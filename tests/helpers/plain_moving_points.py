@@ -36,3 +36,11 @@ def plain_fill_cracks(nearest_px, source, offset_px):
                 if both_px[0] > nearest_px[y, x] + CRACK_PX and abs(both_px[0] - both_px[1]) <= CRACK_PX:
                     source[y, x], nearest_px[y, x], offset_px[y, x] = source[before], both_px[0], 0
                     break
+
+
+def plain_find_places(source, offset_px, new_offset_px):
+    """Return offsets to the places of every second pixel and whether there are any; see `find_places`."""
+    there = np.stack(np.divmod(source, source.shape[1])[::-1], axis=-1) + offset_px.reshape(-1, 2)[source]
+    here = np.stack(np.indices(source.shape)[::-1], axis=-1) + new_offset_px
+    known = source >= 0
+    return np.where(known[..., None], there - here, 0)[::2, ::2], known[::2, ::2]

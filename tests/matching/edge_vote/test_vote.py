@@ -10,7 +10,7 @@ from plain_voting import plain_vote
 from stereoweave.bench.edge_metrics import flying_percent
 from stereoweave.io.images import read_pair
 from stereoweave.learn.data.collage import paint_collage
-from stereoweave.matching.edge_vote.vote import vote_at_edges
+from stereoweave.matching.edge_vote.vote import sharpen_edges, vote_at_edges
 from stereoweave.matching.edge_vote.vote_kernels import vote
 from stereoweave.matching.matcher import Matcher
 from stereoweave.stereo import Estimate
@@ -164,3 +164,41 @@ def test_an_image_of_one_colour_is_no_obstacle():
     noise_px = cv2.GaussianBlur(np.random.default_rng(0).random((32, 32)).astype(np.float32) * 40, (0, 0), 1)
     found = vote_at_edges(grey, estimate_of(noise_px))
     assert np.isfinite(found.disparity_px).all()
+
+
+def thin_bars():
+    """Return a blue image with a lighter bar 2 px wide, and the disparities of it and of one that it lacks."""
+    image, disparity_px = np.zeros((40, 60, 3), np.uint8), np.full((40, 60), 5.0)
+    image[:] = (30, 30, 200)
+    image[:, 15:17] = (60, 60, 200)  # 27 grey levels lighter
+    disparity_px[:, 15:17] = disparity_px[:, 40:42] = 20
+    return image, disparity_px
+
+
+def test_sharp_edges_lie_on_those_of_the_image_and_confidences_do_not_change(red_before_blue):
+    disparity_px = np.full((40, 60), 20.0)
+    disparity_px[:, 30:] = 5
+    disparity_px[:, 28:32] = [17, 14, 11, 8]
+    estimate = estimate_of(disparity_px, confidence=0.7)
+    found = sharpen_edges(red_before_blue, estimate)
+    expected_px = np.where(np.arange(60) < 30, 20.0, 5.0)
+    np.testing.assert_array_equal(found.disparity_px, np.broadcast_to(expected_px, (40, 60)))
+    np.testing.assert_array_equal(found.confidence, estimate.confidence)
+    np.testing.assert_array_equal(found.right_disparity_px, estimate.right_disparity_px)
+
+
+@pytest.mark.parametrize(("confidence", "is_kept"), [(0.9, True), (0.1, False)])
+def test_a_thin_thing_stays_sharp_if_the_image_shows_it_and_it_is_not_unsure(confidence, is_kept):
+    image, disparity_px = thin_bars()
+    expected_px = np.full((40, 60), 5.0)
+    expected_px[:, 15:17] = 20 if is_kept else 5
+    found_px = sharpen_edges(image, estimate_of(disparity_px, confidence)).disparity_px
+    np.testing.assert_array_equal(found_px, expected_px)
+
+
+def test_a_flat_speckle_is_no_edge_to_sharpen(red_before_blue):
+    disparity_px = np.full((40, 60), 20.0)
+    disparity_px[10:14, 10:14] = 22  # a step of less than 3 px, which `vote_at_edges` removes
+    estimate = estimate_of(disparity_px)
+    np.testing.assert_array_equal(sharpen_edges(red_before_blue, estimate).disparity_px, disparity_px)
+    assert (vote_at_edges(red_before_blue, estimate).disparity_px == 20).all()
