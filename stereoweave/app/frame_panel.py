@@ -7,7 +7,7 @@ import gradio as gr
 
 from stereoweave.app.newest_frame import FramePictures
 from stereoweave.app.still_frame import StillFrame
-from stereoweave.app.video_upload import OUTPUTS
+from stereoweave.app.video_outputs import OUTPUTS
 
 _CHOICES = [(output.label, name) for name, output in OUTPUTS.items()]
 
@@ -65,10 +65,8 @@ class FramePanel:
 def _format_pictures(pictures: FramePictures) -> str:
     """Format the pictures as HTML, with the time of the frame and how to look at the second one."""
     output = OUTPUTS[pictures.output]
-    minutes, seconds = divmod(pictures.time_s, 60)
-    time = f"{int(minutes)}:{seconds:04.1f}"
     figures = (
-        _format_figure(pictures.left, f"Left view at {time}"),
+        _format_figure(pictures.left, f"Left view at {pictures.shown_time}"),
         _format_figure(pictures.made, f"{output.label}. {output.viewing}"),
     )
     return f'<div class="frames">{"".join(figures)}</div>'

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from stereoweave.app.video_outputs import OUTPUTS
 from stereoweave.io.files import replacing
 from stereoweave.rendering.scaling import fit_size, scale_down
 
@@ -28,6 +29,7 @@ _RENDERED_PX = 448
 # Pictures follow each other after this time, and later if they would take more than this share of the time;
 # on two cores, 5 % of both.
 _LEAST_S, _MOST_SHARE = 0.25, 0.1
+_MOST_S = 1e9  # no video is as long
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,12 @@ class FramePictures:
     output: str
     left: bytes
     made: bytes
+
+    @property
+    def shown_time(self) -> str:
+        """The time in minutes and seconds, such as 1:02.5 for 62.5 s."""
+        minutes, tenths = divmod(round(10 * self.time_s), 600)
+        return f"{minutes}:{tenths / 10:04.1f}"
 
 
 def make_pictures(
@@ -107,8 +115,11 @@ class NewestFrame:
                 return None
             self._seen_ns = written_ns
             time_s, output, left, made = json.loads(self._file.read_text(encoding="utf-8"))
+            if output not in OUTPUTS or not 0 <= time_s < _MOST_S:
+                return None
             return FramePictures(time_s, output, base64.b64decode(left), base64.b64decode(made))
-        except (OSError, ValueError, TypeError):  # a decoder that a file made crash may have written anything
+        # A decoder that a file made crash may have written anything.
+        except (OSError, ValueError, TypeError, RecursionError):
             return None
 
 

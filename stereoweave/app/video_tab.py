@@ -22,7 +22,8 @@ from stereoweave.app.notices import (
 )
 from stereoweave.app.pair_form import MODELS, make_layout_choice, read_layout
 from stereoweave.app.still_frame import convert_still
-from stereoweave.app.video_upload import OUTPUTS, PREVIEW_S, ConvertedVideo, VideoUpload, convert_upload
+from stereoweave.app.video_outputs import OUTPUTS
+from stereoweave.app.video_upload import PREVIEW_S, ConvertedVideo, VideoUpload, convert_upload
 from stereoweave.errors import StereoweaveError
 from stereoweave.matching.backend import Backend
 from stereoweave.video.packings import FRAME_PACKINGS

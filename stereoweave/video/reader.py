@@ -80,7 +80,7 @@ class StereoVideo:
             frame 1440 on; None for a whole video.
         notes: Notes on views and colours, and on the column or row that is dropped from frames of odd width
             or height.
-        declared_sphere: Projection of a VR180 or 360-degree video, if the file declares one.
+        declared_sphere: Projection of a VR180, 360-degree or ordinary video, if the file declares one.
         sphere: Of a VR180 or 360-degree video, the window that its frames show; see `show`.
         baseline_m: Distance of the eyes of such a video; None if it is unknown.
         hdr_colours: Primaries, transfer function and matrix of HDR, by FFmpeg's numbers; None for SDR.
@@ -259,7 +259,8 @@ def _open_single(path: Path, format: str | None, rate: Fraction | None, sphere: 
     if (format or track.declared_packing) in FRAME_SEQUENTIAL:
         return _open_sequence(track, format)
     name = format or detect_layout(track.name, track.samples(), track.declared_packing)
-    if not format or sphere.projection is not None:
+    is_ordinary = track.sphere is not None and track.sphere.projection is None
+    if sphere.projection is not None or not (format or is_ordinary):
         named = None if track.sphere else track.name
         name = choose_layout(name, named, track.size_px, sphere)
     try:

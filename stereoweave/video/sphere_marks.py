@@ -32,14 +32,19 @@ _MAPPING_BYTES = 32
 
 
 class SphereMark(NamedTuple):
-    """Projection of each eye's image, and the distance of the eyes in metres; None if it is unknown."""
+    """What a file declares.
 
-    projection: Projection
+    Attributes:
+        projection: Projection of each eye's image; None for an ordinary one.
+        baseline_m: Distance of the eyes in metres; None if it is unknown.
+    """
+
+    projection: Projection | None
     baseline_m: float | None
 
 
 def read_sphere(name: str, frame: "av.VideoFrame") -> SphereMark | None:
-    """Return what a frame says about its projection; None if it says nothing, or is an ordinary one.
+    """Return what a frame says about its projection; None if it says nothing.
 
     Raises:
         FormatError: The projection is not supported, or its bounds are impossible.
@@ -52,7 +57,7 @@ def read_sphere(name: str, frame: "av.VideoFrame") -> SphereMark | None:
         return None
     kind = int(np.frombuffer(content, np.int32, 1)[0])
     if kind == RECTILINEAR_MAPPING:
-        return None
+        return SphereMark(None, None)
     if kind not in _NAMES:
         raise FormatError(
             f"{name}: expected an equirectangular or fisheye video, found "

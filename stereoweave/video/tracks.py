@@ -99,7 +99,7 @@ class VideoTrack:
             size, or an unsupported packing; None if the file declares no packing, or is a spatial video.
         is_spatial: Whether the video is a spatial one (MV-HEVC), with each view in a layer of its own.
         camera: Camera of the views of a spatial video, if the file declares it and rotates no views.
-        sphere: Projection of a VR180 or 360-degree video, if the file declares one.
+        sphere: Projection of a VR180, 360-degree or ordinary video, if the file declares one.
         notes: Notes on views and colours.
         hdr_colours: Primaries, transfer function and matrix of HDR, by FFmpeg's numbers; else None.
         sound: Path of the file if it has sound, else None.

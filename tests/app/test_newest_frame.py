@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from stereoweave.app.newest_frame import FramePictures, FrameShower, NewestFrame, make_pictures
-from stereoweave.app.video_upload import OUTPUTS
+from stereoweave.app.video_outputs import OUTPUTS
 from stereoweave.io.colormap import colour_disparity
 from stereoweave.stereo import Estimate, StereoPair
 from stereoweave.video.converted_frames import ConvertedFrame
@@ -164,10 +164,29 @@ def test_a_frame_that_cannot_be_shown_does_not_end_the_conversion(tmp_path):
         FrameShower(newest, "between", job_of)(odd)
 
 
-@pytest.mark.parametrize("content", [b"", b"[", b"[1]", b"{}", b"null", b'[0, "depth", "\xff", ""]'])
+@pytest.mark.parametrize(
+    "content",
+    [
+        *(b"", b"[", b"[1]", b"{}", b"null", b"[" * 100_000, b'[0, "depth", "\xff", ""]'),
+        *(b'[0, %s, "", ""]' % output for output in (b'"unknown"', b'""', b"null", b"7", b"[]", b"{}")),
+        *(
+            b'[%s, "depth", "", ""]' % time_s
+            for time_s in (b'"0"', b"null", b"NaN", b"Infinity", b"-1", b"[0]")
+        ),
+        b'[1%s, "depth", "", ""]' % (400 * b"0"),
+    ],
+)
 def test_a_damaged_hand_over_shows_no_frame(tmp_path, content):
     (tmp_path / "newest.json").write_bytes(content)
     assert NewestFrame(tmp_path).read() is None
+
+
+@pytest.mark.parametrize(
+    ("time_s", "shown"),
+    [(0, "0:00.0"), (59.94, "0:59.9"), (59.97, "1:00.0"), (119.96, "2:00.0"), (3725.25, "62:05.2")],
+)
+def test_the_page_shows_the_time_of_a_frame_in_minutes_and_seconds(time_s, shown):
+    assert FramePictures(time_s, "depth", b"", b"").shown_time == shown
 
 
 def test_colours_are_those_of_the_frame():

@@ -118,6 +118,18 @@ def test_a_name_states_the_projection_of_a_film(tmp_path, half_scene):
     assert "half_equirectangular of 180x180 degrees, detected from the name" in str(video.notes[-1])
 
 
+def test_a_film_that_declares_to_be_ordinary_is_so_whatever_its_name(tmp_path, half_scene):
+    boxes = box(b"vexu", box(b"proj", box(b"prji", bytes(4) + b"rect")))
+    film = write_film(tmp_path / "a_180_LR.mp4", half_scene, count=1)
+    assert open_video([film]).sphere is not None
+    film.write_bytes(with_boxes(film.read_bytes(), boxes))
+    for layout in (None, "side_by_side"):
+        video = open_video([film], layout)
+        assert video.sphere is None and video.size_px[1] == 256
+    chosen = open_video([film], "side_by_side", sphere=SphereRequest(projection="half_equirectangular"))
+    assert chosen.sphere.projection.yaw_deg == (-90, 90)
+
+
 def test_a_window_of_a_film_is_converted_with_its_times(tmp_path, half_scene, capsys):
     times_ms = [0, 40, 90, 130, 200]
     film = write_film(tmp_path / "a.mp4", half_scene, marks=VR180, times_ms=times_ms, sound=True)
