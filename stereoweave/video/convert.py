@@ -84,15 +84,7 @@ def convert_video(
     compile_ahead(rehearse_carrying, *_list_rehearsals(job))
     if job.is_fine:
         video.read_fine()
-    recorder = Recorder(
-        encoding=_choose_encoding(job),
-        time_base=video.time_base,
-        # FFmpeg stores numerators and denominators in 32 bits.
-        rate=video.rate.limit_denominator(100_000),
-        packing=PACKINGS.get(job.layout or ""),
-        colours=Colours(*video.hdr_colours) if job.is_fine and video.hdr_colours else BT709,
-        threads=thread_count(job.backend.threads),
-    )
+    recorder = _make_recorder(job, video)
     with (
         lock_output(out),
         open_parts(out, _list_settings(job, video, sources), job.name_of_saved) as parts,
@@ -120,6 +112,18 @@ def convert_video(
         marks = _mark_output(job, video, warped=converter.has_warped)
         recorder.join(parts.files, video.sound, out, said, marks)
     return replace(converter.tally, frames_per_s=meter.frames_per_s)
+
+
+def _make_recorder(job: VideoJob, video: StereoVideo) -> Recorder:
+    return Recorder(
+        encoding=_choose_encoding(job),
+        time_base=video.time_base,
+        # FFmpeg stores numerators and denominators in 32 bits.
+        rate=video.rate.limit_denominator(100_000),
+        packing=PACKINGS.get(job.layout or ""),
+        colours=Colours(*video.hdr_colours) if job.is_fine and video.hdr_colours else BT709,
+        threads=thread_count(job.backend.threads),
+    )
 
 
 def _choose_encoding(job: VideoJob) -> Encoding:
