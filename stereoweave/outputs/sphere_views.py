@@ -1,11 +1,10 @@
 """New views and layouts for the whole field of view of a VR180 or 360-degree pair, equirectangular again."""
 
 from stereoweave.errors import StereoweaveError
-from stereoweave.io.images import write_image
 from stereoweave.outputs.view_files import ViewFile, WrittenView
 from stereoweave.pictures.panoramas import check_whole_layout, spread_views
 from stereoweave.pictures.prepare import Prepared
-from stereoweave.rendering.layouts import LAYOUTS, median_disparity_px
+from stereoweave.rendering.layouts import LAYOUTS, median_disparity_px, write_picture
 from stereoweave.rendering.renderer import Renderer
 from stereoweave.stereo import Estimate
 from stereoweave.system.steps import step
@@ -14,7 +13,13 @@ from stereoweave.system.steps import step
 def check_whole_view(file: ViewFile) -> None:
     """Raise a StereoweaveError if a file of views cannot show the whole field of view."""
     check_whole_layout(file.name)
-    given = {"up": file.up, "forward": file.forward, "size_px": file.size_px, "crop": file.crops}
+    given = {
+        "up": file.up,
+        "forward": file.forward,
+        "size_px": file.size_px,
+        "crop": file.crops,
+        "screen": file.screen,
+    }
     for setting, value in given.items():
         if value:
             raise StereoweaveError("expected only for a window, found with the whole", setting=setting)
@@ -33,7 +38,7 @@ def write_whole_view(file: ViewFile, prepared: Prepared, estimate: Estimate) -> 
     else:
         image = LAYOUTS[file.name].compose(renderer, file.layout_options)
     spread = spread_views(prepared.sphere.spreader(), image, file.name)
-    write_image(file.path, spread)
+    write_picture(file.path, spread)
     what = f"view at {file.position:g}" if file.name is None else file.name
     name = prepared.sphere.whole_projection.name
     return WrittenView(f"{what}, each {name}, {spread.shape[1]}x{spread.shape[0]} px", spread)
