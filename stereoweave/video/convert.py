@@ -79,7 +79,7 @@ def convert_video(
             because the disk is full.
     """
     _check_output(out, job, video, sources)
-    job = _fit_to_sphere(job, video)
+    job = fit_to_sphere(job, video)
     matcher = load_matcher(job)
     compile_ahead(rehearse_carrying, *_list_rehearsals(job))
     if job.is_fine:
@@ -140,8 +140,12 @@ def _list_rehearsals(job: VideoJob) -> tuple[Rehearsal, ...]:
     return (rehearse_fine_drawing,) if job.is_fine else (rehearse_drawing, rehearse_filling)
 
 
-def _fit_to_sphere(job: VideoJob, video: StereoVideo) -> VideoJob:
-    """Return the job as it is for a window of a VR180 or 360-degree video, or for the whole of it."""
+def fit_to_sphere(job: VideoJob, video: StereoVideo) -> VideoJob:
+    """Return the job as it is for a window of a VR180 or 360-degree video, or for the whole of it.
+
+    Raises:
+        StereoweaveError: The whole cannot be shown as the job says.
+    """
     if video.sphere is None:
         return job
     # The homographies that rectify shots fit perspective images only.
