@@ -24,7 +24,7 @@ from stereoweave.video.carried_frames import rehearse_carrying
 from stereoweave.video.depth_codes import describe_values, find_losses
 from stereoweave.video.frame_converter import FrameConverter, VideoTally, load_matcher
 from stereoweave.video.job import VideoJob
-from stereoweave.video.layout_marks import mark_layout
+from stereoweave.video.layout_marks import find_baseline_m, mark_layout
 from stereoweave.video.mp4_marks import VideoMarks
 from stereoweave.video.parts import open_parts
 from stereoweave.video.reader import StereoVideo, format_time
@@ -162,17 +162,18 @@ def fit_to_sphere(job: VideoJob, video: StereoVideo) -> VideoJob:
 
 def _mark_output(job: VideoJob, video: StereoVideo, *, warped: bool) -> VideoMarks | None:
     """Return what the output says about its views and cameras."""
-    if job.whole is not None:
-        return job.whole.marks(video.baseline_m)
-    # Of a window aside, the marks cannot say that its middle is elsewhere.
-    aside = video.camera is not None and abs(2 * video.camera.cx_px + 1 - video.size_px[0]) > 1
-    return mark_layout(
-        job.layout,
-        None if warped or aside else video.camera,
-        video.size_px[0],
+    baseline_m = find_baseline_m(
+        video.camera.baseline_m if video.camera else video.baseline_m,
         strength=job.strength,
         convergence_px=job.convergence_px or 0.0,
+        fitted=job.screen is not None,
     )
+    if job.whole is not None:
+        return job.whole.marks(baseline_m)
+    # Of a window aside, the marks cannot say that its middle is elsewhere.
+    aside = video.camera is not None and abs(2 * video.camera.cx_px + 1 - video.size_px[0]) > 1
+    camera = None if warped or aside else video.camera
+    return mark_layout(job.layout, camera, video.size_px[0], baseline_m)
 
 
 class _Meter:
