@@ -41,6 +41,7 @@ def convert_still(upload: VideoUpload, report: Callable[[float, str], None]) -> 
         StereoweaveError: See `open_upload`; or the video ends before this time.
     """
     video = open_upload(upload, report)
+    from stereoweave.video.convert import fit_to_sphere
     from stereoweave.video.frame_converter import FrameConverter, load_matcher
     from stereoweave.video.survey import survey_video
 
@@ -48,8 +49,10 @@ def convert_still(upload: VideoUpload, report: Callable[[float, str], None]) -> 
     still = video.excerpt(start_s, float(frame_s / 2))
     report(0.3, "converting one frame")
     seen: list[ConvertedFrame] = []
-    job = replace(make_job(upload, upload.output), on_converted=seen.append)
-    survey, notes = survey_video(still, load_matcher(job), Progress(disable=True), threads=1)
+    job = replace(fit_to_sphere(make_job(upload, upload.output), still), on_converted=seen.append)
+    survey, notes = survey_video(
+        still, load_matcher(job), Progress(disable=True), rectified=job.rectify, threads=1
+    )
     with closing(FrameConverter(job, survey, still.size_px).convert(still.frames())) as converted:
         list(converted)
     last_s = float((video.frame_count - 1) * frame_s)

@@ -224,7 +224,7 @@ class ChunkWorker:
 
         films, _ = self._fetch(entry, scratch / "pictures")
         film_job = VideoJob(depth16=True, backend=job.backend, name_of=job.name_of)
-        video = open_video(films, job.request.format)
+        video = open_video(films, job.request.format, sphere=job.request.sphere)
         with self._open_results(entry, scratch) as out:
             make = partial(convert_video, video, films, out / FILM, film_job, Console(quiet=True))
             begun = parts_folder(out / FILM)

@@ -85,7 +85,8 @@ def check(  # noqa: PLR0913 - each is an option of the command line
             raise
         opened = None
     if opened is None:
-        print_video_check(open_video(pictures, format, sphere=sphere), screen, timeline, as_json)
+        name = ", ".join(picture.name for picture in pictures)
+        print_video_check(open_video(pictures, format, sphere=sphere), name, screen, timeline, as_json)
         return
     refuse_video_options(screen, timeline)
     with step("checking the pair"):

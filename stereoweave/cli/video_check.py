@@ -26,8 +26,13 @@ def is_video(error: FormatError) -> bool:
     return error.remedy is not None and "video" in error.remedy.settings
 
 
-def print_video_check(video: "StereoVideo", screen: str | None, timeline: Path | None, as_json: bool) -> None:
-    """Check a stereo video and print what its shots show; the exit status is 1 if there is a defect."""
+def print_video_check(
+    video: "StereoVideo", name: str, screen: str | None, timeline: Path | None, as_json: bool
+) -> None:
+    """Check a stereo video and print what its shots show; the exit status is 1 if there is a defect.
+
+    `name` is the title of the timeline.
+    """
     from rich.console import Console
 
     from stereoweave.io.animation import require_video_extra
@@ -47,7 +52,7 @@ def print_video_check(video: "StereoVideo", screen: str | None, timeline: Path |
     with progress(Console(stderr=True)) as bar:
         found = check_video(video, Backend(model="small").matcher(), bar, screen=screen)
     if timeline is not None:
-        write_image(timeline, draw_timeline(found, video.name, screen))
+        write_image(timeline, draw_timeline(found, name, screen))
     if as_json:
         typer.echo(json.dumps(_list_facts(found, video.size_px), indent=2, allow_nan=False))
     else:

@@ -22,6 +22,8 @@ _QUALITY = 95
 _INTRINSICS = bytes.fromhex("22cc04c7d6d94e079d904eb6ecbaf3a3")
 # Intrinsics are shares of the width and the height, with this many bits after the point.
 _SHIFT = 28
+# The greatest number of the properties, which have 32 bits.
+_MOST = (1 << 31) - 1
 _HAS_X = 1
 _GROUP = 1000  # libheif numbers items from 1 on; groups share their numbers
 _META_HEAD = 4  # version and flags
@@ -107,13 +109,15 @@ def _find_views(parts: dict[bytes, bytes]) -> tuple[int, int]:
 
 
 def _make_properties(camera: StereoCamera | None, width_px: int) -> tuple[list[bytes], list[bytes]]:
-    """Return the properties of the left and of the right view."""
+    """Return the properties of the left and of the right view; none for a camera beyond their numbers."""
     if camera is None:
         return [], []
     middle = 1 << _SHIFT - 1
     focal = round(camera.focal_px / width_px * (1 << _SHIFT))
-    intrinsics = make_box(b"uuid", _INTRINSICS + struct.pack(">I3i", _SHIFT << 8, focal, middle, middle))
     x_um = round(1e6 * camera.baseline_m)
+    if max(focal, x_um) > _MOST:
+        return [], []
+    intrinsics = make_box(b"uuid", _INTRINSICS + struct.pack(">I3i", _SHIFT << 8, focal, middle, middle))
     left = make_box(b"uuid", EXTRINSICS_UUID + bytes(4))
     right = make_box(b"uuid", EXTRINSICS_UUID + struct.pack(">Ii", _HAS_X, x_um))
     return [intrinsics, left], [intrinsics, right]

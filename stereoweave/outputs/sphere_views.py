@@ -27,7 +27,13 @@ def check_whole_view(file: ViewFile) -> None:
             f"{file.path}: expected the layout {_OF_BOTH} for a VR180 photo, found {file.name or 'one view'}",
             remedy=Remedy("choose it", ("layout",)),
         )
-    given = {"up": file.up, "forward": file.forward, "size_px": file.size_px, "crop": file.crops}
+    given = {
+        "up": file.up,
+        "forward": file.forward,
+        "size_px": file.size_px,
+        "crop": file.crops,
+        "screen": file.screen,
+    }
     for setting, value in given.items():
         if value:
             raise StereoweaveError("expected only for a window, found with the whole", setting=setting)
@@ -47,6 +53,7 @@ def write_whole_view(file: ViewFile, prepared: Prepared, estimate: Estimate) -> 
         image = LAYOUTS[file.name].compose(renderer, file.layout_options)
     spread = spread_views(prepared.sphere.spreader(), image, file.name)
     _write(file.path, spread, prepared.sphere)
+    write_picture(file.path, spread)
     what = f"view at {file.position:g}" if file.name is None else file.name
     name = prepared.sphere.whole_projection.name
     return WrittenView(f"{what}, each {name}, {spread.shape[1]}x{spread.shape[0]} px", spread)

@@ -24,7 +24,7 @@ from stereoweave.video.carried_frames import rehearse_carrying
 from stereoweave.video.depth_codes import describe_values, find_losses
 from stereoweave.video.frame_converter import FrameConverter, VideoTally, load_matcher
 from stereoweave.video.job import VideoJob
-from stereoweave.video.layout_marks import mark_layout
+from stereoweave.video.layout_marks import find_baseline_m, mark_layout
 from stereoweave.video.mp4_marks import VideoMarks
 from stereoweave.video.parts import open_parts
 from stereoweave.video.reader import StereoVideo, format_time
@@ -79,20 +79,12 @@ def convert_video(
             because the disk is full.
     """
     _check_output(out, job, video, sources)
-    job = _fit_to_sphere(job, video)
+    job = fit_to_sphere(job, video)
     matcher = load_matcher(job)
     compile_ahead(rehearse_carrying, *_list_rehearsals(job))
     if job.is_fine:
         video.read_fine()
-    recorder = Recorder(
-        encoding=_choose_encoding(job),
-        time_base=video.time_base,
-        # FFmpeg stores numerators and denominators in 32 bits.
-        rate=video.rate.limit_denominator(100_000),
-        packing=PACKINGS.get(job.layout or ""),
-        colours=Colours(*video.hdr_colours) if job.is_fine and video.hdr_colours else BT709,
-        threads=thread_count(job.backend.threads),
-    )
+    recorder = _make_recorder(job, video)
     with (
         lock_output(out),
         open_parts(out, _list_settings(job, video, sources), job.name_of_saved) as parts,
@@ -122,6 +114,18 @@ def convert_video(
     return replace(converter.tally, frames_per_s=meter.frames_per_s)
 
 
+def _make_recorder(job: VideoJob, video: StereoVideo) -> Recorder:
+    return Recorder(
+        encoding=_choose_encoding(job),
+        time_base=video.time_base,
+        # FFmpeg stores numerators and denominators in 32 bits.
+        rate=video.rate.limit_denominator(100_000),
+        packing=PACKINGS.get(job.layout or ""),
+        colours=Colours(*video.hdr_colours) if job.is_fine and video.hdr_colours else BT709,
+        threads=thread_count(job.backend.threads),
+    )
+
+
 def _choose_encoding(job: VideoJob) -> Encoding:
     if job.depth16:
         return GREY16
@@ -136,8 +140,12 @@ def _list_rehearsals(job: VideoJob) -> tuple[Rehearsal, ...]:
     return (rehearse_fine_drawing,) if job.is_fine else (rehearse_drawing, rehearse_filling)
 
 
-def _fit_to_sphere(job: VideoJob, video: StereoVideo) -> VideoJob:
-    """Return the job as it is for a window of a VR180 or 360-degree video, or for the whole of it."""
+def fit_to_sphere(job: VideoJob, video: StereoVideo) -> VideoJob:
+    """Return the job as it is for a window of a VR180 or 360-degree video, or for the whole of it.
+
+    Raises:
+        StereoweaveError: The whole cannot be shown as the job says.
+    """
     if video.sphere is None:
         return job
     # The homographies that rectify shots fit perspective images only.
@@ -154,17 +162,18 @@ def _fit_to_sphere(job: VideoJob, video: StereoVideo) -> VideoJob:
 
 def _mark_output(job: VideoJob, video: StereoVideo, *, warped: bool) -> VideoMarks | None:
     """Return what the output says about its views and cameras."""
-    if job.whole is not None:
-        return job.whole.marks(video.baseline_m)
-    # Of a window aside, the marks cannot say that its middle is elsewhere.
-    aside = video.camera is not None and abs(2 * video.camera.cx_px + 1 - video.size_px[0]) > 1
-    return mark_layout(
-        job.layout,
-        None if warped or aside else video.camera,
-        video.size_px[0],
+    baseline_m = find_baseline_m(
+        video.camera.baseline_m if video.camera else video.baseline_m,
         strength=job.strength,
         convergence_px=job.convergence_px or 0.0,
+        fitted=job.screen is not None,
     )
+    if job.whole is not None:
+        return job.whole.marks(baseline_m)
+    # Of a window aside, the marks cannot say that its middle is elsewhere.
+    aside = video.camera is not None and abs(2 * video.camera.cx_px + 1 - video.size_px[0]) > 1
+    camera = None if warped or aside else video.camera
+    return mark_layout(job.layout, camera, video.size_px[0], baseline_m)
 
 
 class _Meter:

@@ -68,6 +68,8 @@ def describe_values(
         if camera:
             text += f"; depth in metres = {camera.focal_px * camera.baseline_m:.6g} / disparity"
         return {"comment": text + ending}
+    if job.depth and job.whole is not None:
+        return {"comment": job.whole.describe_nearness(survey.range_px)}
     if job.depth:
         low, high = (_describe_disparity(value_px, camera) for value_px in survey.range_px)
         return {"comment": f"disparity of the left view: {low} is blue, {high} is red{ending}"}

@@ -41,7 +41,7 @@ class VideoTally:
     """Counts of frames, cuts and frames with problems so far, and descriptions of the first problems.
 
     `frames_per_s` is the speed of the conversion since it was last started; 0 while it runs. `comfort` says
-    how the depth was fitted to the job's screen; it is set at the end.
+    how the depth was fitted to the job's screen; it is set at the end, and by `FrameConverter.from_state`.
     """
 
     frames: int = 0
@@ -107,6 +107,8 @@ class FrameConverter:
         screen = converter._squeezed.job.screen
         if screen:
             converter._comfort = ComfortPath.from_state(screen, state)
+            # All frames may be converted already.
+            converter.tally.comfort = converter._comfort.describe(size_px[0])
         return converter
 
     def state(self) -> dict[str, np.ndarray]:
@@ -153,6 +155,7 @@ class FrameConverter:
         """Yield output images that show the pictures of both cameras as they are, which needs no matching."""
         for frame, pair in chain.from_iterable(zip(*group, strict=True) for group in groups):
             self.tally.add(frame)
+            self._grouper.began_shot(frame)  # or the grouper would remember all cuts
             joined = to_16_bits(join(*frame.fine())) if frame.fine else join(pair.left, pair.right)
             yield frame.time, joined
 

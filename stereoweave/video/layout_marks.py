@@ -3,7 +3,7 @@
 from math import atan, degrees
 
 from stereoweave.stereo import StereoCamera
-from stereoweave.video.mp4_marks import VideoMarks
+from stereoweave.video.mp4_marks import MOST_BASELINE_M, VideoMarks
 
 # The packing of each layout with one view for each eye, and whether the right view comes first.
 PACKED = {
@@ -15,8 +15,25 @@ PACKED = {
 }
 
 
+def find_baseline_m(
+    baseline_m: float | None, *, strength: float, convergence_px: float, fitted: bool
+) -> float | None:
+    """Return the distance of the cameras of new views; None if unknown, or if it would give no depth.
+
+    Args:
+        baseline_m: Distance of the cameras of the video; None if it is unknown.
+        strength: Factor by which it was multiplied.
+        convergence_px: Disparity that the views were shifted by.
+        fitted: Whether both were chosen for a screen instead, frame by frame.
+    """
+    if baseline_m is None or convergence_px or fitted:
+        return None
+    scaled_m = strength * baseline_m
+    return scaled_m if 0 < scaled_m <= MOST_BASELINE_M else None
+
+
 def mark_layout(
-    layout: str | None, camera: StereoCamera | None, width_px: int, *, strength: float, convergence_px: float
+    layout: str | None, camera: StereoCamera | None, width_px: int, baseline_m: float | None
 ) -> VideoMarks | None:
     """Return the marks of a layout; None for one that does not hold one view for each eye.
 
@@ -24,19 +41,16 @@ def mark_layout(
         layout: A name in `LAYOUTS`.
         camera: Camera of the views; None if it is unknown.
         width_px: Width of a view at the camera's scale.
-        strength: Factor by which the baseline was multiplied.
-        convergence_px: Disparity that the views were shifted by. The baseline is then left out, because
-            depth could no longer be computed from it.
+        baseline_m: Distance of the cameras of the new views (`find_baseline_m`).
     """
     if layout not in PACKED:
         return None
     packing, right_first = PACKED[layout]
     if camera is None:
         return VideoMarks(packing=packing, right_first=right_first)
-    baseline_m = strength * camera.baseline_m
     return VideoMarks(
         packing=packing,
         right_first=right_first,
         field_of_view_deg=degrees(2 * atan(width_px / (2 * camera.focal_px))),
-        baseline_m=baseline_m if baseline_m > 0 and convergence_px == 0 else None,
+        baseline_m=baseline_m,
     )

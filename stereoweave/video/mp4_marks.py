@@ -33,7 +33,9 @@ _PROJECTIONS = {
 }
 # Horizontal and vertical angle of a whole picture, in degrees.
 _COVERED_DEG = {"equirectangular": (360.0, 180.0), "half_equirectangular": (180.0, 180.0)}
-_MOST_BASELINE_M, _MOST_DEG = 1000.0, 360.0
+MOST_BASELINE_M = 1000.0
+"""Greatest distance of cameras that is believed, and written."""
+_MOST_DEG = 360.0
 
 _SOURCE = b"Stereoweave\0"
 _HAS_LEFT, _HAS_RIGHT, _RIGHT_FIRST = 1, 2, 8
@@ -90,7 +92,7 @@ class VideoMarks:
         for name, number, most in (
             ("field_of_view_deg", self.field_of_view_deg, whole_deg[0]),
             ("vertical_field_of_view_deg", self.vertical_field_of_view_deg, whole_deg[1]),
-            ("baseline_m", self.baseline_m, _MOST_BASELINE_M),
+            ("baseline_m", self.baseline_m, MOST_BASELINE_M),
         ):
             if number is not None and not 0 < number <= most:
                 raise StereoweaveError(f"{name}: expected above 0 and at most {most:g}, found {number}")

@@ -10,6 +10,7 @@ import numpy as np
 
 from stereoweave.errors import Note
 from stereoweave.stereo import StereoCamera
+from stereoweave.video.mp4_marks import MOST_BASELINE_M
 
 if TYPE_CHECKING:
     import av
@@ -35,7 +36,7 @@ class Stereo3D:
         kind: Frame packing, FFmpeg's AVStereo3DType.
         is_inverted: Whether the right view comes first.
         view: Which view the frame is, FFmpeg's AVStereo3DView.
-        baseline_m: Distance of the cameras; 0 if unknown.
+        baseline_m: Distance of the cameras; 0 if unknown, or not to be believed.
         adjustment_percent: Shift of the views against each other that players apply, in percent of the width.
         field_of_view_deg: Horizontal field of view; 0 if unknown.
     """
@@ -153,7 +154,7 @@ def parse_stereo3d(data: Any) -> Stereo3D | None:
         kind,
         bool(flags & 1),
         view,
-        baseline_m=max(baseline_um, 0) / 1e6,
+        baseline_m=baseline_um / 1e6 if 0 < baseline_um <= 1e6 * MOST_BASELINE_M else 0.0,
         adjustment_percent=100 * shift / shift_unit if shift_unit else 0.0,
         field_of_view_deg=angle / angle_unit if angle_unit else 0.0,
     )

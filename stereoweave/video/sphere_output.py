@@ -33,16 +33,24 @@ class WholeOutput:
         nearness = self._window.nearness(estimate.disparity_px) * self._window.focal_px
         return replace(estimate, disparity_px=np.where(self._blind, 0, nearness).astype(np.float32))
 
+    def describe_nearness(self, range_px: tuple[float, float]) -> str:
+        """Return what the colours of `measure_nearness` mean, for their range."""
+        low_px, high_px = range_px
+        return (
+            f"nearness in the left view: {low_px:.2f} px is blue, {high_px:.2f} px is red; distance = "
+            f"{self._window.focal_px:.6g} / px baselines; 0 px where the baseline vanishes"
+        )
+
     def spread(self, picture: Picture) -> Picture:
         """Return an equirectangular output frame."""
         return spread_views(self._spreader, picture, self._layout)
 
     def marks(self, baseline_m: float | None) -> VideoMarks:
-        """Return what the output file says about its views; `baseline_m` is their distance, if known."""
+        """Return what the output file says about its views; `baseline_m` is as in `mark_layout`."""
         packing, right_first = PACKED.get(self._layout or "", (None, False))
         return VideoMarks(
             packing=packing,
             right_first=right_first,
             projection=self._name,
-            baseline_m=baseline_m if packing and baseline_m else None,
+            baseline_m=baseline_m if packing else None,
         )

@@ -4,10 +4,12 @@ import io
 import math
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
 from spatial_examples import SPATIAL
+from sphere_scenes import render_turning
 from video_examples import example_pairs, flat_pairs, packed, truncate, write_side_by_side, write_video
 
 from stereoweave.app.still_frame import convert_still
@@ -16,6 +18,7 @@ from stereoweave.app.video_upload import VideoUpload
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.images import write_image
 from stereoweave.matching.backend import Backend
+from stereoweave.video.reader import open_video
 
 pytestmark = pytest.mark.system
 
@@ -74,6 +77,17 @@ def test_a_spatial_video_of_another_writer_is_shown(testdata):
     still = show(ask(testdata / "consumer" / "stereo_spatial.mp4", output="anaglyph_dubois"))
     assert opened(still.pictures.left).shape == opened(still.pictures.made).shape
     assert opened(still.pictures.made).std() > 10
+
+
+def test_a_window_of_a_360_degree_film_is_not_rectified_as_in_the_conversion(tmp_path):
+    scene = render_turning((768, 384))
+    left, right = (cv2.GaussianBlur(eye, (0, 0), 2) for eye in (scene.left, np.roll(scene.right, 8, axis=0)))
+    film = write_side_by_side(
+        tmp_path / "a_360.mp4", [(left, right)] * 2, layout="top_bottom", codec="libx264"
+    )
+    made = opened(show(ask(film, output="side_by_side", format="top_bottom")).pictures.made)
+    read = next(iter(open_video([film], "top_bottom").frames()))
+    assert np.abs(made - np.hstack([read.left, read.right])).mean() < 5
 
 
 def odd_uploads(folder: Path) -> dict[str, VideoUpload]:

@@ -24,6 +24,7 @@ from stereoweave.batch import worker as cluster_worker
 from stereoweave.batch.cluster import _check_folders, _read_job_files, run_cluster
 from stereoweave.batch.manifest import extend_plan, read_chunk, read_rows
 from stereoweave.batch.worker import FILM, ChunkWorker, remove_abandoned
+from stereoweave.cameras.spherical import SphereRequest
 from stereoweave.cli.root import main
 from stereoweave.errors import MatcherError, OutputInUseError, ProviderError, Remedy, StereoweaveError
 from stereoweave.io.images import read_image, write_image
@@ -33,6 +34,7 @@ from stereoweave.io.stores import store_at
 from stereoweave.matching.backend import Backend, _load
 from stereoweave.matching.matcher import Matcher, model_file
 from stereoweave.outputs.results import DepthJob, make_depth
+from stereoweave.pictures.prepare import Request
 from stereoweave.system.ray_engine import Engine, connect
 from stereoweave.video.parts import parts_folder
 
@@ -365,6 +367,19 @@ def test_a_video_is_processed_after_parts_of_another_video_are_removed(tmp_path)
     assert (row["files"], row["error"], row["width_px"]) == ([FILM], None, 160)
     assert len(packets(tmp_path / "out" / "sea.mkv" / FILM, "video")) == 3
     assert not parts.exists()
+
+
+def test_a_video_is_processed_by_the_projection_that_is_given(tmp_path):
+    (tmp_path / "films").mkdir()
+    write_side_by_side(tmp_path / "films" / "sea.mkv", example_pairs(2))
+    source, out = store_at(tmp_path / "films"), store_at(tmp_path / "out")
+    [chunk] = extend_plan(source, out, workers=1).chunks
+    sphere = SphereRequest(projection="half_equirectangular", fov_deg=60.0)
+    job = replace(JOB, request=Request(format="side_by_side", sphere=sphere))
+    assert ChunkWorker(source, out, job)([chunk]).made == 1
+    [row] = read_rows(out, chunk).values()
+    # 160 px over 180 degrees are 50.9 px a radian; of 60 degrees, 2 * 50.9 * tan(30 degrees) = 58.8.
+    assert (row["files"], row["error"], row["width_px"]) == ([FILM], None, 58)
 
 
 def test_a_spatial_video_is_processed(tmp_path):

@@ -1,4 +1,5 @@
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -52,6 +53,15 @@ def test_without_a_camera_only_the_group_is_added(tmp_path):
     opened = open_pictures([tmp_path / "photo.heic"])
     assert opened.lens is None or not opened.lens.is_known
     assert np.abs(opened.pair.right.astype(int) - RIGHT).mean() < 5
+    assert open_heif(tmp_path / "photo.heic").info["entity_groups"][0]["type"] == "ster"
+
+
+@pytest.mark.parametrize("changes", [{"focal_px": 1280.0}, {"baseline_m": 2148.0}])
+def test_a_camera_beyond_the_format_s_numbers_is_left_out(tmp_path, changes):
+    # The numbers have 32 bits: a focal length of less than 8 widths, and micrometres.
+    write_spatial_photo(tmp_path / "photo.heic", LEFT, RIGHT, replace(CAMERA, **changes))
+    opened = open_pictures([tmp_path / "photo.heic"])
+    assert opened.lens is None or not opened.lens.is_known
     assert open_heif(tmp_path / "photo.heic").info["entity_groups"][0]["type"] == "ster"
 
 

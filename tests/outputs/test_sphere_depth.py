@@ -142,12 +142,29 @@ def test_a_vr180_photo_is_written_and_opened_again(tmp_path):
         assert np.abs(eyes[0] - eyes[1]).mean() < 2
 
 
+@pytest.mark.parametrize("ending", [".mpo", ".heic", ".jps"])
+def test_views_of_the_whole_are_written_as_3d_pictures(tmp_path, ending):
+    scene = render_fixed(look_equirectangular((128, 128)))
+    left, right = (cv2.GaussianBlur(eye, (0, 0), 2) for eye in (scene.left, scene.right))
+    path = save(tmp_path / "a_180.png", left, right)
+    words = path, "--whole", "--format", "side_by_side", "--model", "small"
+    assert run("view", *words, "-o", tmp_path / f"b{ending}") == 0
+    pair = open_pictures([tmp_path / f"b{ending}"]).pair
+    for eye, expected in ((pair.left, left), (pair.right, right)):
+        assert np.abs(eye.astype(int) - expected).mean() < 4
+
+
 @pytest.mark.parametrize(
     ("command", "words", "said"),
     [
         ("depth", ["--whole"], "--whole: expected only for VR180 and 360-degree files"),
         ("depth", ["--whole", "--projection", "fisheye", "--write", "all"], "--write: expected no further"),
         ("view", ["--whole", "--layout", "quilt"], "expected one of side_by_side, crossed"),
+        (
+            "view",
+            ["--whole", "--layout", "side_by_side", "--screen", "television"],
+            "--screen: expected only for a window, found with the whole",
+        ),
         ("view", ["--whole", "--up", "0.5"], "--up: expected only for a window, found with the whole"),
         ("view", ["--look", "30"], "--look: expected yaw and pitch in degrees, such as 30,-10, found '30'"),
         ("check", ["--projection", "equirectangular", "--look", "0,85"], "--look: expected a window"),

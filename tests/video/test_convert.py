@@ -38,6 +38,7 @@ from stereoweave.rendering.layouts import LAYOUTS, LayoutOptions, squeeze
 from stereoweave.rendering.renderer import Renderer
 from stereoweave.stereo import StereoCamera, StereoPair
 from stereoweave.video.convert import convert_video
+from stereoweave.video.frame_groups import FrameGrouper
 from stereoweave.video.job import VideoJob
 from stereoweave.video.reader import StereoFrame, StereoVideo, open_video
 
@@ -300,6 +301,18 @@ def interrupt(patch: pytest.MonkeyPatch) -> None:
             yield frame
 
     patch.setattr(StereoVideo, "frames", frames)
+
+
+def test_cuts_are_forgotten_where_views_are_joined_without_matching(tmp_path, monkeypatch):
+    cuts = []
+    asked = FrameGrouper.began_shot
+    monkeypatch.setattr(FrameGrouper, "began_shot", lambda *given: cuts.append(asked(*given)) or cuts[-1])
+    noise = np.random.default_rng(0).uniform(0, 255, (2, 96, 128, 3))
+    one, other = (np.clip(4 * cv2.GaussianBlur(shot, (0, 0), 1.5) - 384, 0, 255) for shot in noise)
+    pairs = [(shot.astype(np.uint8),) * 2 for shot in (one, one, one, other, other)]
+    video = write_side_by_side(tmp_path / "in.mp4", pairs, codec="libx264")
+    assert run(video, tmp_path / "out.mp4", "--layout", "crossed", "--format", "side_by_side") == 0
+    assert cuts == [False, False, False, True, False]
 
 
 @pytest.mark.parametrize(

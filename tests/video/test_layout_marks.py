@@ -4,12 +4,12 @@ import av
 import numpy as np
 import pytest
 from av.sidedata.sidedata import Type
-from spatial_examples import SPATIAL
+from spatial_examples import SPATIAL, spatial_boxes, with_boxes
 from video_examples import example_pairs, write_side_by_side
 
 from stereoweave.cli.root import main
 from stereoweave.stereo import StereoCamera
-from stereoweave.video.layout_marks import mark_layout
+from stereoweave.video.layout_marks import find_baseline_m, mark_layout
 from stereoweave.video.reader import open_video
 
 # 90 degrees at a width of 200 px.
@@ -30,23 +30,28 @@ def stereo_3d(path):
     return [*numbers[:3], *numbers[4:]]
 
 
+UNCHANGED = {"strength": 1.0, "convergence_px": 0.0, "fitted": False}
+
+
 def test_strength_scales_the_baseline():
-    marks = mark_layout("top_bottom", CAMERA, 200, strength=1.5, convergence_px=0.0)
+    baseline_m = find_baseline_m(0.06, **UNCHANGED | {"strength": 1.5})
+    marks = mark_layout("top_bottom", CAMERA, 200, baseline_m)
     assert (marks.packing, marks.right_first) == ("top_bottom", False)
     assert marks.field_of_view_deg == pytest.approx(90)
     assert marks.baseline_m == pytest.approx(0.09)
 
 
-@pytest.mark.parametrize("changes", [{"strength": 0.0}, {"convergence_px": 3.0}])
+@pytest.mark.parametrize("changes", [{"strength": 0.0}, {"convergence_px": 3.0}, {"fitted": True}])
 def test_a_baseline_that_gives_no_depth_is_left_out(changes):
-    marks = mark_layout("side_by_side", CAMERA, 200, **{"strength": 1.0, "convergence_px": 0.0} | changes)
+    baseline_m = find_baseline_m(0.06, **UNCHANGED | changes)
+    marks = mark_layout("side_by_side", CAMERA, 200, baseline_m)
     assert marks.baseline_m is None
     assert marks.field_of_view_deg == pytest.approx(90)
 
 
 @pytest.mark.parametrize("layout", [None, "anaglyph_dubois", "quilt", "rgbd", "contact_sheet"])
 def test_layouts_without_a_view_for_each_eye_are_not_marked(layout):
-    assert mark_layout(layout, CAMERA, 200, strength=1.0, convergence_px=0.0) is None
+    assert mark_layout(layout, CAMERA, 200, 0.06) is None
 
 
 @pytest.mark.parametrize(
@@ -62,6 +67,21 @@ def test_a_layout_of_a_spatial_video_is_marked_with_its_camera(tmp_path, layout,
     assert (video.frame_packing, video.size_px) == (layout, (320, 192))
     assert video.camera.focal_px == pytest.approx(160 * sqrt(3))
     assert video.camera.baseline_m == 0.0635
+
+
+def test_views_fitted_to_a_screen_are_marked_without_a_baseline(tmp_path):
+    words = "--layout", "side_by_side", "--screen", "television", "--preview", "0.1s"
+    assert run(SPATIAL, "-o", tmp_path / "out.mov", *words) == 0
+    assert stereo_3d(tmp_path / "out_LRF_Full_SBS.mov") == [1, 0, 0, 0, 0, 1, 60000, 1000]
+
+
+@pytest.mark.parametrize(("baseline_um", "strength"), [(2_000_000_000, 1), (900_000_000, 2)])
+def test_a_baseline_above_a_kilometre_is_left_out(tmp_path, baseline_um, strength):
+    far = spatial_boxes(baseline_um=baseline_um, degrees=60)
+    (tmp_path / "in.mp4").write_bytes(with_boxes(SPATIAL.read_bytes(), far))
+    words = "--layout", "side_by_side", "--strength", strength, "--preview", "0.1s"
+    assert run(tmp_path / "in.mp4", "-o", tmp_path / "out.mov", *words) == 0
+    assert stereo_3d(tmp_path / "out_LRF_Full_SBS.mov")[3] == 0
 
 
 def test_crossed_views_of_unknown_cameras_are_marked_as_such(tmp_path):

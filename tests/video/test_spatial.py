@@ -306,6 +306,12 @@ def test_declared_stereo_of_another_length_is_read_as_far_as_it_is_known():
     assert read_stereo3d(SimpleNamespace(side_data={Type.STEREO3D: numbers[:20]})) is None
 
 
+@pytest.mark.parametrize(("baseline_um", "baseline_m"), [(10**9, 1000.0), (10**9 + 1, 0.0), (-5, 0.0)])
+def test_an_implausible_baseline_is_unknown(baseline_um, baseline_m):
+    numbers = np.array([8, 0, 0, 0, baseline_um, 0, 1, 60, 1], np.int32).tobytes()
+    assert read_stereo3d(SimpleNamespace(side_data={Type.STEREO3D: numbers})).baseline_m == baseline_m
+
+
 def test_a_frame_that_filters_refuse_is_not_spatial():
     frame = av.VideoFrame(0, 0, "yuv420p")
     frame.time_base = Fraction(1, 25)

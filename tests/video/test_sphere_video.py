@@ -1,3 +1,4 @@
+import re
 import struct
 from fractions import Fraction
 
@@ -169,6 +170,30 @@ def test_the_whole_of_a_film_becomes_vr180_again(tmp_path, half_scene, layout, p
         one = np.vstack(np.split(one, 2, axis=1))
     middle = np.s_[40:216, 40:216]
     assert psnr_db(other[middle], one[middle]) > 30
+
+
+@pytest.mark.parametrize(
+    ("words", "baseline_m"),
+    [(["--strength", 0.5], 0.0315), (["--convergence", 2], None), (["--screen", "headset"], None)],
+)
+def test_the_baseline_of_a_whole_film_is_that_of_its_new_views(tmp_path, half_scene, words, baseline_m):
+    film = write_film(tmp_path / "a.mp4", half_scene, marks=VR180 | {"baseline_m": 0.063}, count=1)
+    words = "--whole", "--layout", "side_by_side", *words, "--threads", 1
+    assert run("video", film, *words, "-o", tmp_path / "b.mp4") == 0
+    [out] = tmp_path.glob("b*.mp4")
+    assert open_video([out]).declared_sphere.baseline_m == baseline_m
+
+
+def test_the_colours_of_a_whole_film_are_explained_as_nearness(tmp_path, half_scene):
+    film = write_film(tmp_path / "a.mp4", half_scene, marks=VR180, count=1)
+    assert run("video", film, "--whole", "--depth", "--threads", 1, "-o", tmp_path / "b.mp4") == 0
+    with av.open(str(tmp_path / "b.mp4")) as container:
+        comment = container.metadata["comment"]
+    # 256 px over 180 degrees: 81.4873 px a radian.
+    assert re.sub(r"\d[\d.]* px is", "N px is", comment) == (
+        "nearness in the left view: N px is blue, N px is red; distance = 81.4873 / px baselines; 0 px where "
+        "the baseline vanishes"
+    )
 
 
 def test_a_view_and_the_depth_of_a_whole_film_have_one_eye(tmp_path, half_scene):

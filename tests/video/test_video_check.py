@@ -209,6 +209,17 @@ def test_an_odd_video_gets_a_line(name, tmp_path, capsys):
         assert picture.size == (1600, 940)
 
 
+def test_the_timeline_names_the_file_without_its_folder(tmp_path):
+    pictures = []
+    for folder in (tmp_path, tmp_path / "another folder"):
+        folder.mkdir(exist_ok=True)
+        video = write_side_by_side(folder / "in.mp4", flat_pairs(1), codec="libx264")
+        run(video, "--format", "side_by_side", "--timeline", folder / "t.png")
+        with Image.open(folder / "t.png") as picture:
+            pictures.append(np.asarray(picture))
+    np.testing.assert_array_equal(*pictures)
+
+
 def test_a_cut_file_is_checked_as_far_as_it_goes_and_says_so(tmp_path, capsys):
     whole = write_side_by_side(
         tmp_path / "cut.mkv", shot_of(TEXTURED, 20), codec="libx264", options={"g": "4"}

@@ -12,11 +12,13 @@ from faulty_video_examples import box_at_the_left_border, shot_of
 from video_examples import TEXTURED, example_pairs, flat_pairs, truncate, write_side_by_side
 
 from stereoweave.cli.root import main
+from stereoweave.errors import StereoweaveError
 from stereoweave.matching.estimate import match
 from stereoweave.matching.matcher import Matcher
 from stereoweave.rendering.comfort import measure_depth
 from stereoweave.stereo import StereoPair
 from stereoweave.video.reader import StereoFrame, StereoVideo, open_video
+from stereoweave.video.writer import Recorder
 
 # A part lasts 4 s, so it has 5 of these frames.
 SLOW_MS = 800
@@ -104,6 +106,21 @@ def test_an_interrupted_conversion_for_a_screen_resumes_with_the_same_frames(
     np.testing.assert_array_equal(frames_of(broken), frames_of(whole))
     # The line at the end counts the frames before the interruption, too.
     assert capsys.readouterr().out.splitlines()[1] == before[1]
+
+
+def test_a_conversion_that_stopped_before_the_parts_were_joined_still_reports_the_screen(
+    tmp_path, monkeypatch, capsys
+):
+    def fail(*_):
+        raise StereoweaveError("no space")
+
+    video = write_side_by_side(tmp_path / "in.mp4", example_pairs(1), codec="libx264")
+    words = "--layout", "side_by_side", "--screen", "phone"
+    with monkeypatch.context() as patch:
+        patch.setattr(Recorder, "join", fail)
+        assert run(video, tmp_path / "out.mp4", *words) == 2
+    assert run(video, tmp_path / "out.mp4", *words) == 0
+    assert capsys.readouterr().out.splitlines()[1].startswith("phone: strength ")
 
 
 def test_parts_for_another_screen_are_not_resumed(tmp_path, monkeypatch, capsys):
