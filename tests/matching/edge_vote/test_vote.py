@@ -167,7 +167,7 @@ def test_an_image_of_one_colour_is_no_obstacle():
 
 
 def thin_bars():
-    """Return a blue image with a lighter bar 2 px wide, and disparities of this bar and of one that it lacks."""
+    """Return a blue image with a lighter bar 2 px wide, and disparities of it and of a bar that it lacks."""
     image, disparity_px = np.zeros((40, 60, 3), np.uint8), np.full((40, 60), 5.0)
     image[:] = (30, 30, 200)
     image[:, 15:17] = (60, 60, 200)  # 27 grey levels lighter
