@@ -53,7 +53,6 @@ def write_whole_view(file: ViewFile, prepared: Prepared, estimate: Estimate) -> 
         image = LAYOUTS[file.name].compose(renderer, file.layout_options)
     spread = spread_views(prepared.sphere.spreader(), image, file.name)
     _write(file.path, spread, prepared.sphere)
-    write_picture(file.path, spread)
     what = f"view at {file.position:g}" if file.name is None else file.name
     name = prepared.sphere.whole_projection.name
     return WrittenView(f"{what}, each {name}, {spread.shape[1]}x{spread.shape[0]} px", spread)

@@ -221,9 +221,9 @@ def test_a_sliver_does_not_matter_if_the_user_gives_the_projection(tmp_path, hal
 def test_the_field_of_view_of_a_lens_is_refused_for_an_equirectangular_file(tmp_path, half_scene):
     path = tmp_path / "a.vr.jpg"
     path.write_bytes(make_vr180(half_scene.left, half_scene.right))
-    assert f"expected only for a fisheye, found with {path}, which is half_equirectangular" in refusal(
-        path, lens_fov_deg=190
-    )
+    told = refusal(path, lens_fov_deg=190)
+    assert f"expected only for a fisheye, found with {path}, which is half_equirectangular" in told
+    assert "omit it, or choose " in told and "fisheye" in told
     assert open_pictures([path], None, SphereRequest(projection="fisheye", lens_fov_deg=190)).sphere
 
 

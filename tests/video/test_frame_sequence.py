@@ -212,7 +212,9 @@ def test_a_film_without_any_whole_pair_is_refused(tmp_path):
     path = write_video(tmp_path / "a.avi", in_turn(example_pairs(3)), codec="mjpeg")
     for frame in (1, 3, 5):
         damage(path, frame, length=400)
-    assert "found no left frame that can be decoded together with its right frame" in refusal(path)
+    told = refusal(path)
+    assert "found no left frame that can be decoded together with its right frame" in told
+    assert "copy the video again" in told
 
 
 def test_pictures_without_any_whole_pair_are_refused(tmp_path):
