@@ -13,6 +13,7 @@ from collections.abc import Callable
 
 from stereoweave.system.kernel_cache import compile_once, kernels_folder
 from stereoweave.system.shipped_kernels import find_shipped, flatten
+from stereoweave.system.threads import beyond_ctrl_c
 
 _SETTINGS: dict[str, typing.Any] = {"nogil": True, "fastmath": True, "error_model": "numpy"}
 
@@ -66,12 +67,16 @@ class Kernel:
                 return
         code = self.dispatcher
         if not code.signatures:
-            from numba import typeof
-
-            _, _, module = self._function.__module__.rpartition(".")
-            with compile_once(self.name, f"*/{module}.{self._function.__qualname__}-*.nbi"):
-                code.compile(tuple(map(typeof, arguments)))
+            beyond_ctrl_c(lambda: self._compile(arguments))
         code(*arguments)
+
+    def _compile(self, arguments: tuple[typing.Any, ...]) -> None:
+        """Let Numba load or compile the function for such arguments."""
+        from numba import typeof
+
+        _, _, module = self._function.__module__.rpartition(".")
+        with compile_once(self.name, f"*/{module}.{self._function.__qualname__}-*.nbi"):
+            self.dispatcher.compile(tuple(map(typeof, arguments)))
 
     @property
     def dispatcher(self) -> typing.Any:

@@ -25,6 +25,7 @@ from uuid import uuid4
 import numpy as np
 
 from stereoweave.system.kernel_cache import compile_once, kernels_folder
+from stereoweave.system.threads import beyond_ctrl_c
 
 Words = list[int | float]
 """Arguments as a kernel's machine code takes them: each array as seven numbers or more, tuples flattened."""
@@ -136,7 +137,7 @@ class ShippedKernel:
         Raises:
             MemoryError: There is too little memory for the kernel's own arrays.
         """
-        run = self._run or self._prepare()
+        run = self._run or beyond_ctrl_c(self._prepare)
         if run(ctypes.byref(ctypes.c_void_p()), ctypes.byref(ctypes.c_void_p()), *words):
             raise MemoryError(self.name)
 

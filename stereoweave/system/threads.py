@@ -4,9 +4,12 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
+from typing import TypeVar
 
 from stereoweave.arguments import check_whole_number
 from stereoweave.errors import StereoweaveError
+
+Result = TypeVar("Result")
 
 _MOST_THREADS = 1024
 
@@ -40,3 +43,13 @@ def in_bands(work: Callable[[int, int], None], height: int, count: int, threads:
     contexts = [copy_context() for _ in range(count)]
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(lambda context, *rows: context.run(work, *rows), contexts, ends[:-1], ends[1:]))
+
+
+def beyond_ctrl_c(work: Callable[[], Result]) -> Result:
+    """Return what `work` returns, from a thread of its own.
+
+    Python raises KeyboardInterrupt in the main thread alone. There, it may come between the taking of a lock
+    and the block that releases it; the lock is then held for as long as anyone holds the error.
+    """
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(copy_context().run, work).result()

@@ -243,8 +243,8 @@ def test_a_stopped_command_says_so_and_leaves_nothing(tmp_path, number):
     pictures = [REPOSITORY / "examples" / f"{eye}.png" for eye in ("left", "right")]
     program = (
         # As in a terminal: a shell that starts the tests in the background lets them ignore Ctrl-C.
-        "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
-        "signal.signal(signal.SIGHUP, signal.SIG_DFL); "
+        "import faulthandler, signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
+        "signal.signal(signal.SIGHUP, signal.SIG_DFL); faulthandler.dump_traceback_later(120, exit=True); "
         "from stereoweave.cli.root import main; sys.exit(main())"
     )
     command = [sys.executable, "-c", program, "depth", *pictures, "-o", tmp_path / "out"]
@@ -253,7 +253,8 @@ def test_a_stopped_command_says_so_and_leaves_nothing(tmp_path, number):
         time.sleep(0.01)
     assert process.poll() is None
     process.send_signal(number)
-    assert process.communicate(timeout=60)[1].splitlines()[-1] == "stereoweave: stopped"
+    told = process.communicate()[1]
+    assert told.splitlines()[-1] == "stereoweave: stopped", told
     assert process.returncode == 128 + number
     assert [path for path in tmp_path.rglob("*") if path.name.startswith(".stereoweave-")] == []
 
