@@ -5,17 +5,24 @@ Media File Formats and Spatial and Immersive Media". PyAV cannot set them, so th
 descriptions (ISO/IEC 14496-12) of a finished file.
 """
 
-import os
 import shutil
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO
 
 from stereoweave.errors import FormatError, StereoweaveError
-from stereoweave.io.boxes import Box, change_boxes, make_box, make_full_box, split_boxes
+from stereoweave.io.boxes import (
+    Box,
+    Place,
+    change_boxes,
+    find_boxes,
+    make_box,
+    make_full_box,
+    split_boxes,
+)
 from stereoweave.io.files import replacing
 
 # stereo_mode of `st3d`, without and with the right view first; None where the RFC has no number. Then the
@@ -107,14 +114,6 @@ class VideoMarks:
         return self.projection in _COVERED_DEG
 
 
-class _Place(NamedTuple):
-    """Where a box of the top level starts and ends in its file."""
-
-    kind: bytes
-    start: int
-    end: int
-
-
 def write_marks(path: Path, marks: VideoMarks) -> None:
     """Write the marks into the first video track of a finished MP4 or MOV file; earlier marks are replaced.
 
@@ -127,7 +126,7 @@ def write_marks(path: Path, marks: VideoMarks) -> None:
     """
     try:
         with path.open("r+b") as file:
-            places = list(_find_places(file))
+            places = list(find_boxes(file, _MOST_BOXES))
             index = _find_index(places)
             file.seek(index.start)
             old = file.read(index.end - index.start)
@@ -298,33 +297,7 @@ def _move_chunks(table: bytes, number: str, moved_from: int, by: int) -> bytes:
     return table[:8] + struct.pack(f">{count}{number}", *moved) + table[8 + count * size :]
 
 
-def _find_places(file: BinaryIO) -> Iterator[_Place]:
-    """Yield the boxes on the top level of a file.
-
-    Raises:
-        FormatError: One of them is damaged or cut off, or there are very many.
-    """
-    total = os.fstat(file.fileno()).st_size
-    start = 0
-    for _ in range(_MOST_BOXES):
-        if start == total:
-            return
-        file.seek(start)
-        size, kind, long_size = struct.unpack(">I4sQ", file.read(16).ljust(16, b"\0"))
-        head = 16 if size == 1 else 8
-        # A size of 0 stands for the rest of the file.
-        size = {0: total - start, 1: long_size}.get(size, size)
-        if size < head or start + size > total:
-            raise FormatError(
-                f"expected whole boxes, found {kind!r} with {size} bytes of which the file holds "
-                f"{total - start}; record or write the file again"
-            )
-        yield _Place(kind, start, start + size)
-        start += size
-    raise FormatError(f"expected at most {_MOST_BOXES} boxes, found more; write the file again")
-
-
-def _find_index(places: Sequence[_Place]) -> _Place:
+def _find_index(places: Sequence[Place]) -> Place:
     kinds = {place.kind for place in places}
     if b"moof" in kinds:
         raise FormatError(
@@ -342,7 +315,7 @@ def _find_index(places: Sequence[_Place]) -> _Place:
     return found[0]
 
 
-def _check_movable(places: Sequence[_Place], index: bytes) -> None:
+def _check_movable(places: Sequence[Place], index: bytes) -> None:
     """Raise FormatError if more than the tables of chunks names places, so that no data can be moved."""
     others = [repr(kind) for kind in sorted({place.kind for place in places} - _PLACELESS)]
     others += [repr(kind) for kind in _PLACES_IN_INDEX if kind in index]
@@ -353,7 +326,7 @@ def _check_movable(places: Sequence[_Place], index: bytes) -> None:
         )
 
 
-def _replace_index(path: Path, index: _Place, new: bytes) -> None:
+def _replace_index(path: Path, index: Place, new: bytes) -> None:
     """Write the file again, with another index in its place."""
     with replacing(path) as temporary, path.open("rb") as old, temporary.open("wb") as file:
         _copy_bytes(old, file, index.start)
