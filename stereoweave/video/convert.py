@@ -24,7 +24,7 @@ from stereoweave.video.carried_frames import rehearse_carrying
 from stereoweave.video.depth_codes import describe_values, find_losses
 from stereoweave.video.frame_converter import FrameConverter, VideoTally, load_matcher
 from stereoweave.video.job import VideoJob
-from stereoweave.video.layout_marks import find_baseline_m, mark_layout
+from stereoweave.video.layout_marks import PACKED, find_baseline_m, mark_layout
 from stereoweave.video.mp4_marks import VideoMarks
 from stereoweave.video.parts import open_parts
 from stereoweave.video.reader import StereoVideo, format_time
@@ -39,7 +39,6 @@ from stereoweave.video.writer import (
     HEVC10,
     Colours,
     Encoding,
-    Packing,
     Picture,
     Recorder,
     check_container,
@@ -47,14 +46,6 @@ from stereoweave.video.writer import (
 
 # Length of a part, which begins with a key frame. An interrupted run loses only the unfinished part.
 PART_S = 4
-
-PACKINGS = {
-    "side_by_side": Packing("left_right", 3),
-    "side_by_side_half": Packing("left_right", 3),
-    "crossed": Packing("right_left", None),
-    "top_bottom": Packing("top_bottom", 4),
-    "top_bottom_half": Packing("top_bottom", 4),
-}
 
 
 def convert_video(
@@ -120,7 +111,7 @@ def _make_recorder(job: VideoJob, video: StereoVideo) -> Recorder:
         time_base=video.time_base,
         # FFmpeg stores numerators and denominators in 32 bits.
         rate=video.rate.limit_denominator(100_000),
-        packing=PACKINGS.get(job.layout or ""),
+        packing=PACKED[job.layout].declared if job.layout in PACKED else None,
         colours=Colours(*video.hdr_colours) if job.is_fine and video.hdr_colours else BT709,
         threads=thread_count(job.backend.threads),
     )
