@@ -27,9 +27,10 @@ from stereoweave.video.job import VideoJob
 from stereoweave.video.layout_marks import PACKED, find_baseline_m, mark_layout
 from stereoweave.video.mp4_marks import VideoMarks
 from stereoweave.video.parts import open_parts
-from stereoweave.video.reader import StereoVideo, format_time
+from stereoweave.video.reader import StereoVideo
 from stereoweave.video.sphere_output import WholeOutput
 from stereoweave.video.survey import survey_video
+from stereoweave.video.times import format_time
 from stereoweave.video.tracks import list_picture_files
 from stereoweave.video.writer import (
     BT709,
@@ -84,7 +85,8 @@ def convert_video(
         if parts.files:
             converter = FrameConverter.from_state(job, parts.state(), video.size_px)
             done_s = converter.tally.frames / video.rate
-            _print_line(console, f"{out.name}: resuming at {format_time(Fraction(round(done_s)))[:-4]}")
+            resumed = format_time(done_s, decimals=0, hours=True)
+            _print_line(console, f"{out.name}: resuming at {resumed}")
         else:
             survey, notes = survey_video(
                 video, matcher, bar, rectified=job.rectify, threads=job.backend.threads

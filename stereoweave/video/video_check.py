@@ -18,7 +18,8 @@ from stereoweave.rendering.comfort import SCREENS, Depth, ScreenFit, find_screen
 from stereoweave.system.ahead import ahead
 from stereoweave.video.frame_check import FrameCheck, check_frame
 from stereoweave.video.motion import CUT_SHARE, convert_to_grey, measure_motion
-from stereoweave.video.reader import StereoFrame, StereoVideo, format_time
+from stereoweave.video.reader import StereoFrame, StereoVideo
+from stereoweave.video.times import format_frame_time
 
 # A shot's first frame may be part of a fade, so the first sample is this much later.
 _FIRST_S, _EVERY_S = Fraction(1, 5), Fraction(1)
@@ -203,7 +204,7 @@ def _take_samples(video: StereoVideo, spans: list[_Span], problems: list[str]) -
     waiting: StereoFrame | None = None
     for number, frame in enumerate(video.frames()):
         if frame.problem is not None:
-            problems.append(f"{format_time(frame.time)} {frame.problem}")
+            problems.append(f"{format_frame_time(frame.time)} {frame.problem}")
         grey = _make_small_grey(frame.left)
         if last_grey is None or measure_motion(last_grey, grey).explained_share < CUT_SHARE:
             if waiting:
