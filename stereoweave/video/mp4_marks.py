@@ -5,25 +5,13 @@ Media File Formats and Spatial and Immersive Media". PyAV cannot set them, so th
 descriptions (ISO/IEC 14496-12) of a finished file.
 """
 
-import shutil
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
-from typing import BinaryIO
 
 from stereoweave.errors import FormatError, StereoweaveError
-from stereoweave.io.boxes import (
-    Box,
-    Place,
-    change_boxes,
-    find_boxes,
-    make_box,
-    make_full_box,
-    split_boxes,
-)
-from stereoweave.io.files import replacing
+from stereoweave.io.boxes import Box, Place, change_boxes, find_boxes, make_box, make_full_box, split_boxes
 
 # stereo_mode of `st3d`, without and with the right view first; None where the RFC has no number. Then the
 # packing kind of `pkin`.
@@ -54,10 +42,6 @@ _OPTIONAL = frozenset({b"clap", b"pasp", b"colr", b"fiel", b"btrt", b"chrm", b"g
 # Bytes of a visual sample description, and of `stsd`, before their boxes.
 _ENTRY_BYTES, _STSD_BYTES = 78, 8
 _TABLE = b"mdia", b"minf", b"stbl"
-# Boxes on the top level that state no place in the file.
-_PLACELESS = frozenset({b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot", b"uuid", b"udta"})
-# Boxes within the index that do: of encrypted samples, and of items such as pictures.
-_PLACES_IN_INDEX = b"saio", b"iloc"
 # The index of ten hours at 60 frames a second with sound has about 60 MB.
 _MOST_INDEX_BYTES = 500_000_000
 _MOST_BOXES = 100_000  # on the top level of a file
@@ -117,28 +101,22 @@ class VideoMarks:
 def write_marks(path: Path, marks: VideoMarks) -> None:
     """Write the marks into the first video track of a finished MP4 or MOV file; earlier marks are replaced.
 
-    Pictures, sound and times stay as they are. A file with its index at the end is changed in place, so
-    that nobody else should read it yet.
+    Pictures, sound and times stay as they are. The file is changed in place, so that nobody else should read
+    it yet.
 
     Raises:
-        FormatError: The file is damaged, has no index, no video track or several of them, or consists of
-            fragments.
+        FormatError: The file is damaged, has no index or one that is not its last box, no video track or
+            several of them, or consists of fragments.
     """
     try:
         with path.open("r+b") as file:
             places = list(find_boxes(file, _MOST_BOXES))
             index = _find_index(places)
             file.seek(index.start)
-            old = file.read(index.end - index.start)
-            if index is places[-1]:
-                new = mark_index(old, marks)
-                file.seek(index.start)
-                file.write(new)
-                file.truncate()
-                return
-            _check_movable(places, old)
-            new = mark_index(old, marks, moved_from=index.end)
-        _replace_index(path, index, new)
+            new = mark_index(file.read(), marks)
+            file.seek(index.start)
+            file.write(new)
+            file.truncate()
     except FormatError as error:
         raise error.with_prefix(f"{path}: ") from error
     except OSError as error:
@@ -161,14 +139,12 @@ def show_bounds(marks: VideoMarks) -> VideoMarks:
     )
 
 
-def mark_index(index: bytes, marks: VideoMarks, *, moved_from: int | None = None) -> bytes:
+def mark_index(index: bytes, marks: VideoMarks) -> bytes:
     """Return the box `moov` with the marks in its video track.
 
     Args:
         index: The whole box.
         marks: What to mark; marks that are there already are replaced.
-        moved_from: Place in the file from which on all media data moves by as much as the box grows. None if
-            the box is the last one.
 
     Raises:
         FormatError: The box is damaged, or has no video track or several.
@@ -185,14 +161,7 @@ def mark_index(index: bytes, marks: VideoMarks, *, moved_from: int | None = None
             "write the file again with one video track"
         )
     boxes = make_boxes(marks)
-    new = make_box(b"moov", change_boxes(moov.content, (b"trak",), lambda track: _mark_track(track, boxes)))
-    if moved_from is None:
-        return new
-    grown = len(new) - len(index)
-    for kind, number in ((b"stco", "I"), (b"co64", "Q")):
-        move = partial(_move_chunks, number=number, moved_from=moved_from, by=grown)
-        new = change_boxes(new, (b"moov", b"trak", *_TABLE, kind), move)
-    return new
+    return make_box(b"moov", change_boxes(moov.content, (b"trak",), lambda track: _mark_track(track, boxes)))
 
 
 def make_boxes(marks: VideoMarks) -> tuple[bytes, bytes]:
@@ -285,18 +254,6 @@ def _is_video(track: bytes) -> bool:
     )
 
 
-def _move_chunks(table: bytes, number: str, moved_from: int, by: int) -> bytes:
-    """Return the content of `stco` or `co64` after the chunks from a place on moved."""
-    count, size = int.from_bytes(table[4:8]), struct.calcsize(number)
-    if len(table) < 8 + count * size:
-        raise FormatError("expected a table of chunks in the index, found one cut off; write the file again")
-    places = struct.unpack_from(f">{count}{number}", table, 8)
-    moved = [place + by if place >= moved_from else place for place in places]
-    if moved and max(moved) >= 1 << 8 * size:
-        raise FormatError("expected a file below 4 GB, or with its index at the end; write the file again")
-    return table[:8] + struct.pack(f">{count}{number}", *moved) + table[8 + count * size :]
-
-
 def _find_index(places: Sequence[Place]) -> Place:
     kinds = {place.kind for place in places}
     if b"moof" in kinds:
@@ -306,6 +263,11 @@ def _find_index(places: Sequence[Place]) -> Place:
     found = [place for place in places if place.kind == b"moov"]
     if len(found) != 1:
         raise FormatError(f"expected one index (moov), found {len(found) or 'none'}; write the file again")
+    if found[0] is not places[-1]:
+        # The tables of an index count from the start of the file, so media data must not move.
+        raise FormatError(
+            "expected the index (moov) at the end, found it before other boxes; write the file again"
+        )
     size_bytes = found[0].end - found[0].start
     if size_bytes > _MOST_INDEX_BYTES:
         raise FormatError(
@@ -313,29 +275,3 @@ def _find_index(places: Sequence[Place]) -> Place:
             f"{size_bytes // 1_000_000} MB; write the file again"
         )
     return found[0]
-
-
-def _check_movable(places: Sequence[Place], index: bytes) -> None:
-    """Raise FormatError if more than the tables of chunks names places, so that no data can be moved."""
-    others = [repr(kind) for kind in sorted({place.kind for place in places} - _PLACELESS)]
-    others += [repr(kind) for kind in _PLACES_IN_INDEX if kind in index]
-    if others:
-        raise FormatError(
-            f"expected an index that alone names places in the file, found {', '.join(others)}; "
-            "write the file again with its index at the end"
-        )
-
-
-def _replace_index(path: Path, index: Place, new: bytes) -> None:
-    """Write the file again, with another index in its place."""
-    with replacing(path) as temporary, path.open("rb") as old, temporary.open("wb") as file:
-        _copy_bytes(old, file, index.start)
-        file.write(new)
-        old.seek(index.end)
-        shutil.copyfileobj(old, file)
-
-
-def _copy_bytes(source: BinaryIO, target: BinaryIO, count: int) -> None:
-    while count and (block := source.read(min(count, 1 << 20))):
-        target.write(block)
-        count -= len(block)
