@@ -60,7 +60,6 @@ class VideoMarks:
             an equirectangular picture.
         vertical_field_of_view_deg: Vertical angle of an equirectangular view; None for 180 degrees.
         baseline_m: Distance of the cameras; None if unknown.
-        adjustment_percent: Shift of the views against each other that players apply, in percent of the width.
     """
 
     packing: str | None = None
@@ -69,7 +68,6 @@ class VideoMarks:
     field_of_view_deg: float | None = None
     vertical_field_of_view_deg: float | None = None
     baseline_m: float | None = None
-    adjustment_percent: float = 0.0
 
     def __post_init__(self) -> None:
         for name, value, known in (
@@ -87,10 +85,6 @@ class VideoMarks:
         ):
             if number is not None and not 0 < number <= most:
                 raise StereoweaveError(f"{name}: expected above 0 and at most {most:g}, found {number}")
-        if not abs(self.adjustment_percent) <= 100:
-            raise StereoweaveError(
-                f"adjustment_percent: expected -100 to 100 percent, found {self.adjustment_percent}"
-            )
 
     @property
     def is_panorama(self) -> bool:
@@ -194,9 +188,6 @@ def _make_eyes(marks: VideoMarks) -> bytes:
     parts = make_full_box(b"stri", bytes([views])) + make_full_box(b"hero", bytes([_LEFT_IS_HERO]))
     if marks.baseline_m:
         parts += make_box(b"cams", make_full_box(b"blin", struct.pack(">I", round(1e6 * marks.baseline_m))))
-    if marks.adjustment_percent:
-        adjustment = struct.pack(">i", round(100 * marks.adjustment_percent))
-        parts += make_box(b"cmfy", make_full_box(b"dadj", adjustment))
     return make_box(b"eyes", parts)
 
 

@@ -13,10 +13,10 @@ from stereoweave.video.mp4_marks import VideoMarks, make_boxes, mark_index, writ
 from stereoweave.video.reader import open_video
 
 SIDE_BY_SIDE = VideoMarks(packing="side_by_side")
-# The box `eyes` of a spatial video that Apple's encoder wrote: 19.24 mm, and 2 % of the width.
+# The box `eyes` of a spatial video that Apple's encoder wrote, 19.24 mm, but for its disparity adjustment.
 EYES = bytes.fromhex(
-    "0000005265796573 0000000d73747269 0000000003 0000000d6865726f 0000000001"
-    "0000001863616d73 00000010626c696e 00000000 00004b28 00000018636d6679 000000106461646a 00000000 000000c8"
+    "0000003a65796573 0000000d73747269 0000000003 0000000d6865726f 0000000001"
+    "0000001863616d73 00000010626c696e 00000000 00004b28"
 )
 HFOV = bytes.fromhex("0000000c68666f76 0000f7a8")
 
@@ -63,9 +63,7 @@ def found(boxes, kind):
 
 
 def test_cameras_are_marked_as_apples_encoder_marks_them():
-    marks = VideoMarks(
-        packing="side_by_side", field_of_view_deg=63.4, baseline_m=0.01924, adjustment_percent=2.0
-    )
+    marks = VideoMarks(packing="side_by_side", field_of_view_deg=63.4, baseline_m=0.01924)
     google, apple = make_boxes(marks)
     assert apple == box(b"vexu", EYES + box(b"pack", box(b"pkin", b"\0\0\0\0side"))) + HFOV
     assert google == bytes.fromhex("0000000d73743364 00000000 02")
@@ -105,13 +103,11 @@ def test_a_right_view_that_comes_first_is_marked(packing, mode):
 def test_ffmpeg_reads_the_marks_and_the_same_packets(film, name):
     path = film(name, sound=True)
     pictures, sound = packets(path, "video"), packets(path, "audio")
-    marks = VideoMarks(
-        packing="side_by_side", field_of_view_deg=63.4, baseline_m=0.0635, adjustment_percent=-1.5
-    )
+    marks = VideoMarks(packing="side_by_side", field_of_view_deg=63.4, baseline_m=0.0635)
     write_marks(path, marks)
     # AVStereo3D: side by side, not inverted, both views, the left one is the primary eye, micrometres, then
     # two fractions.
-    assert side_data(path, Type.STEREO3D) == [1, 0, 0, 1, 63500, -150, 10000, 63400, 1000]
+    assert side_data(path, Type.STEREO3D) == [1, 0, 0, 1, 63500, 0, 1, 63400, 1000]
     assert (packets(path, "video"), packets(path, "audio")) == (pictures, sound)
     assert len(pictures) == 5 and sound
 
@@ -256,8 +252,6 @@ def test_a_huge_index_is_refused_before_it_is_read(film, monkeypatch):
         ({"vertical_field_of_view_deg": 10.0}, "vertical_field_of_view_deg: expected"),
         ({"baseline_m": -0.06}, "baseline_m: expected above 0"),
         ({"baseline_m": float("inf")}, "baseline_m: expected above 0"),
-        ({"adjustment_percent": 101.0}, "adjustment_percent: expected -100 to 100 percent"),
-        ({"adjustment_percent": float("nan")}, "adjustment_percent: expected -100 to 100 percent"),
     ],
 )
 def test_marks_that_cannot_be_are_refused(settings, said):
