@@ -138,7 +138,7 @@ def view(  # noqa: PLR0913 - each is an option of the command line
     from stereoweave.matching.backend import Backend
     from stereoweave.matching.estimate import match
     from stereoweave.matching.options import MatchOptions
-    from stereoweave.outputs.sphere_views import check_whole_view, write_whole_view
+    from stereoweave.outputs.sphere_views import check_extent, write_whole_view
     from stereoweave.outputs.view_files import ViewFile
     from stereoweave.pictures.prepare import prepare
     from stereoweave.rendering.layouts import choose_layout, is_converged
@@ -166,8 +166,7 @@ def view(  # noqa: PLR0913 - each is an option of the command line
     )
     options = MatchOptions(range_px=parse_range_px(range_px), refined=True)
     sphere = make_sphere_request(projection, look, fov, lens_fov, whole)
-    if whole:
-        check_whole_view(file)
+    check_extent(file, whole=whole)
     prepared = prepare(pictures, make_request(format, calib, rectify=rectify, sphere=sphere))
     pair = prepared.pair if whole else crop_to_content(prepared.pair)
     file = file.add_mark(pair)

@@ -146,6 +146,17 @@ def test_a_vr180_photo_is_written_and_opened_again(tmp_path):
         assert np.abs(eyes[0] - eyes[1]).mean() < 2
 
 
+def test_a_window_is_no_vr180_photo(tmp_path, capsys):
+    image = np.zeros((128, 256, 3), np.uint8)
+    path, out = save(tmp_path / "a_180.png", image, image), tmp_path / "window.VR.jpg"
+    assert run("view", path, "--format", "side_by_side", "--layout", "side_by_side", "-o", out) == 2
+    assert capsys.readouterr().err == (
+        f"stereoweave: {out}: expected the whole field of view for a VR180 photo, found a window; take the "
+        "whole, or name the file otherwise (--whole)\n"
+    )
+    assert not out.exists()
+
+
 @pytest.mark.parametrize("ending", [".mpo", ".heic", ".jps"])
 def test_views_of_the_whole_are_written_as_3d_pictures(tmp_path, ending):
     scene = render_fixed(look_equirectangular((128, 128)))
