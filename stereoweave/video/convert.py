@@ -30,7 +30,7 @@ from stereoweave.video.parts import open_parts
 from stereoweave.video.reader import StereoVideo
 from stereoweave.video.sphere_output import WholeOutput
 from stereoweave.video.survey import survey_video
-from stereoweave.video.times import format_time
+from stereoweave.video.times import PART_S, format_time
 from stereoweave.video.tracks import list_picture_files
 from stereoweave.video.writer import (
     BT709,
@@ -44,9 +44,6 @@ from stereoweave.video.writer import (
     Recorder,
     check_container,
 )
-
-# Length of a part, which begins with a key frame. An interrupted run loses only the unfinished part.
-PART_S = 4
 
 
 def convert_video(

@@ -1,6 +1,9 @@
-"""Times within a video, as text."""
+"""Times within a video, as text, and the length of its parts."""
 
 from fractions import Fraction
+
+PART_S = 4
+"""Length of a part of a conversion, which begins with a key frame; an interrupted run loses only the last."""
 
 
 def format_time(time_s: float | Fraction, *, decimals: int = 1, hours: bool = False) -> str:
