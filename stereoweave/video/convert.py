@@ -15,6 +15,7 @@ from rich.progress import Progress
 from stereoweave import __version__
 from stereoweave.errors import Remedy, StereoweaveError
 from stereoweave.io.output_lock import lock_output
+from stereoweave.matching.edge_vote.vote import rehearse_voting
 from stereoweave.pictures.panoramas import NO_SPHERE
 from stereoweave.rendering.rehearsals import rehearse_drawing, rehearse_filling, rehearse_fine_drawing
 from stereoweave.system.compiling_ahead import Rehearsal, compile_ahead
@@ -70,7 +71,7 @@ def convert_video(
     _check_output(out, job, video, sources)
     job = fit_to_sphere(job, video)
     matcher = load_matcher(job)
-    compile_ahead(rehearse_carrying, *_list_rehearsals(job))
+    compile_ahead(*_list_rehearsals(job))
     if job.is_fine:
         video.read_fine()
     recorder = _make_recorder(job, video)
@@ -125,9 +126,13 @@ def _choose_encoding(job: VideoJob) -> Encoding:
 
 
 def _list_rehearsals(job: VideoJob) -> tuple[Rehearsal, ...]:
-    if job.depth or job.depth10 or job.depth16:
+    """Return rehearsals of the kernels of a conversion; none if it only joins the frames of both cameras."""
+    if job.join and not job.on_converted:
         return ()
-    return (rehearse_fine_drawing,) if job.is_fine else (rehearse_drawing, rehearse_filling)
+    depth = rehearse_carrying, rehearse_voting
+    if job.depth or job.depth10 or job.depth16:
+        return depth
+    return (*depth, rehearse_fine_drawing) if job.is_fine else (*depth, rehearse_drawing, rehearse_filling)
 
 
 def fit_to_sphere(job: VideoJob, video: StereoVideo) -> VideoJob:

@@ -260,6 +260,36 @@ def _red_from_green(anaglyph: np.ndarray) -> float:
     return np.abs(anaglyph[..., 0].astype(int) - anaglyph[..., 1]).mean()
 
 
+@pytest.mark.parametrize(
+    ("settings", "names"),
+    [
+        ({"depth": True}, ["rehearse_carrying", "rehearse_voting"]),
+        (
+            {"position": 0.5},
+            ["rehearse_carrying", "rehearse_voting", "rehearse_drawing", "rehearse_filling"],
+        ),
+        (
+            {"position": 0.5, "bits": 10},
+            ["rehearse_carrying", "rehearse_voting", "rehearse_fine_drawing"],
+        ),
+        ({"layout": "side_by_side"}, []),
+    ],
+    ids=["depth", "view", "view in 10 bits", "frames joined without matching"],
+)
+def test_the_kernels_of_a_conversion_are_compiled_ahead(tmp_path, monkeypatch, settings, names):
+    asked = []
+
+    def stop(*rehearsals):
+        asked.extend(rehearse.__name__ for rehearse in rehearsals)
+        raise StereoweaveError("enough")
+
+    monkeypatch.setattr("stereoweave.video.convert.compile_ahead", stop)
+    film = write_side_by_side(tmp_path / "in.mp4", example_pairs(1), codec="libx264")
+    with pytest.raises(StereoweaveError, match="enough"):
+        convert_video(open_video([film]), [film], tmp_path / "out.mp4", VideoJob(**settings), Console())
+    assert asked == names
+
+
 def test_cuts_are_forgotten_where_views_are_joined_without_matching(tmp_path, monkeypatch):
     cuts = []
     asked = FrameGrouper.began_shot
