@@ -10,14 +10,17 @@ from jaxtyping import Float32, UInt8, UInt16
 _PQ, _HLG = 16, 18
 HDR = {_PQ: "PQ", _HLG: "HLG"}
 """Names of the transfer functions of HDR."""
-_PRIMARIES_BT709 = 1
+_PRIMARIES_BT709, _PRIMARIES_P3 = 1, 12
 
 # Luminance of a white surface and of the brightest highlights (ITU-R BT.2408). The first becomes SDR's peak.
 _WHITE_NITS, _PEAK_NITS = 203.0, 1000.0
 _PQ_PEAK_NITS = 10_000.0
-# ITU-R BT.2087: linear RGB of BT.2020 to that of BT.709.
+# Linear RGB of BT.2020 (ITU-R BT.2087), and of Display P3 (CSS Color 4), to that of BT.709.
 _BT2020_TO_BT709 = np.array(
     [[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]], np.float32
+)
+_P3_TO_BT709 = np.array(
+    [[1.2249, -0.2249, 0.0], [-0.0421, 1.0421, 0.0], [-0.0196, -0.0786, 1.0983]], np.float32
 )
 _LUMA_BT2020 = np.array([[0.2627, 0.6780, 0.0593]], np.float32)
 # FFmpeg's conversion to 16-bit RGB makes this of white; it rounds to 65283.
@@ -33,6 +36,11 @@ def map_tones(
 
     The brightest channel of each pixel is compressed by the curve of ITU-R BT.2390, and the others in
     proportion, which keeps the hue. Colours outside BT.709 are clipped.
+
+    Args:
+        codes: RGB; white is `WHITE_CODE`.
+        transfer: Number of the transfer function, one in `HDR`.
+        primaries: Number of the primaries; unknown ones are taken for those of BT.2020.
     """
     light = _linear_table(transfer)[codes]
     if transfer == _HLG:
@@ -42,7 +50,8 @@ def map_tones(
     steps = np.sqrt(np.sqrt(light.max(axis=2))) * (_GAINS - 1) + 0.5
     light *= _gain_table()[np.minimum(steps, _GAINS - 1).astype(np.uint16)][..., None]
     if primaries != _PRIMARIES_BT709:
-        light = cv2.transform(light, _BT2020_TO_BT709)
+        to_bt709 = _P3_TO_BT709 if primaries == _PRIMARIES_P3 else _BT2020_TO_BT709
+        light = cv2.transform(light, to_bt709)
     return _srgb_table()[(np.clip(light, 0, 1) * 65535 + 0.5).astype(np.uint16)]
 
 

@@ -11,11 +11,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+from jaxtyping import UInt8
 from PIL import Image
 
 from stereoweave.errors import FormatError, StereoweaveError, require_extra
 from stereoweave.io import exif
 from stereoweave.io.boxes import Box, find_boxes, split_readable_boxes
+from stereoweave.io.hdr import HDR, WHITE_CODE, map_tones
 
 BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"})
 ENDINGS = frozenset({".heic", ".heif", ".hif"})
@@ -28,6 +31,7 @@ _MOST_BYTES = 500_000_000
 # pictures and their 50 hidden tiles.
 _MOST_META_BYTES = 1_000_000
 _MOST_PICTURES = 20
+_BAND_ROWS = 256
 _MOST_BOXES = 1000  # on the top level of a file
 # Types of items that are no pictures.
 OTHER_ITEMS = frozenset({b"Exif", b"mime", b"uri "})
@@ -141,6 +145,35 @@ def read_lens(path: Path, picture: Any) -> exif.Lens | None:
         source="the HEIC file",
     )
     return lens if lens.is_known else None
+
+
+def name_hdr(picture: Any) -> str | None:
+    """Return the name of the transfer function of an HDR picture, PQ or HLG; None for an ordinary picture."""
+    return HDR.get((picture.info.get("nclx_profile") or {}).get("transfer_characteristics", 0))
+
+
+def read_hdr(path: Path, picture: Any) -> UInt8[np.ndarray, "h w 3"]:
+    """Decode the current picture of an open HDR file with all its bits, and map its tones to sRGB.
+
+    Pillow's pictures have 8 bits, in which the steps of HDR are visible.
+
+    Raises:
+        Exception: The file is damaged; pillow-heif raises SyntaxError, ValueError and others.
+    """
+    from pillow_heif import open_heif
+
+    deep = open_heif(path, convert_hdr_to_8bit=False)[picture.tell()]
+    stored = np.asarray(deep)
+    colours, bits = deep.info["nclx_profile"], deep.info["bit_depth"]
+    # pillow-heif shifts the bits of deep pictures up to the 16th.
+    white = 255 if stored.dtype == np.uint8 else ((1 << bits) - 1) << 16 - bits
+    channels = stored[..., :3] if stored.ndim == 3 else np.broadcast_to(stored[..., None], (*stored.shape, 3))
+    shown = np.empty(channels.shape, np.uint8)
+    for start in range(0, len(shown), _BAND_ROWS):  # light takes 12 bytes a pixel
+        rows = slice(start, start + _BAND_ROWS)
+        codes = np.rint(channels[rows] * np.float32(WHITE_CODE / white)).astype(np.uint16)
+        shown[rows] = map_tones(codes, colours["transfer_characteristics"], colours["color_primaries"])
+    return shown
 
 
 def _check_meta(path: Path, meta: bytes) -> None:
