@@ -233,3 +233,11 @@ def bucket(s3: str) -> str:
     name = f"bucket-{uuid4().hex}"
     urlopen(Request(f"{s3}/{name}", method="PUT")).close()
     return f"s3://{name}"
+
+
+@pytest.fixture
+def default_interrupts():
+    """Restore the handler for Ctrl-C, which Python ignores if a shell starts the tests in the background."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)

@@ -17,8 +17,9 @@ from stereoweave.bench.flicker_videos import render_panning
 from stereoweave.io.output_lock import lock_output
 from stereoweave.matching.backend import Backend
 from stereoweave.synth.sets.pair_rendering import RenderSpec
-from stereoweave.video.convert import PACKINGS, convert_video
+from stereoweave.video.convert import convert_video
 from stereoweave.video.job import VideoJob
+from stereoweave.video.layout_marks import PACKED
 from stereoweave.video.reader import open_video
 from stereoweave.video.writer import H264, Recorder
 
@@ -82,7 +83,7 @@ def write_video(path: Path, scene: str, size_px: tuple[int, int], frames: int) -
     there = [np.hstack([pair.left, pair.right]) for pair in rendered.pairs]
     shown = islice(cycle([*there, *there[-2:0:-1]]), frames)
     recorder = Recorder(
-        encoding=H264, time_base=1 / _RATE, rate=_RATE, packing=PACKINGS["side_by_side"], threads=1
+        encoding=H264, time_base=1 / _RATE, rate=_RATE, packing=PACKED["side_by_side"].declared, threads=1
     )
     part = path.with_suffix(".nut")
     recorder.write_part(part, ((number / _RATE, picture) for number, picture in enumerate(shown)))

@@ -1,7 +1,6 @@
 """Videos and spatial photos that are marked as 3-D: their boxes are read and changed."""
 
 from fractions import Fraction
-from functools import partial
 from pathlib import Path
 
 import av
@@ -21,15 +20,14 @@ _CAMERA = StereoCamera(focal_px=100.0, baseline_m=0.06, cx_px=48.0, cy_px=32.0)
 
 def _starts() -> dict[str, bytes]:
     return {
-        "end.mp4": write_to_bytes("end.mp4", partial(_write_video, options={})),
-        "front.mp4": write_to_bytes("front.mp4", partial(_write_video, options={"movflags": "faststart"})),
+        "packed.mp4": write_to_bytes("packed.mp4", _write_video),
         _SPATIAL.name: _SPATIAL.read_bytes(),
         "pair.heic": write_to_bytes("pair.heic", _write_photo),
     }
 
 
-def _write_video(path: Path, options: dict[str, str]) -> None:
-    with av.open(str(path), "w", options=options) as container:
+def _write_video(path: Path) -> None:
+    with av.open(str(path), "w") as container:
         stream = container.add_stream("mpeg4", rate=25)
         assert isinstance(stream, av.VideoStream)
         image = np.hstack(eyes(0))
@@ -58,7 +56,7 @@ TARGET = Target(
     starts=_starts,
     read=_read,
     tokens=tuple(
-        b"moov trak mdia minf stbl stsd hdlr vide stco co64 moof mdat free st3d sv3d vexu hfov avc1 hvc1 "
+        b"moov trak mdia minf stbl stsd hdlr vide moof mdat free st3d sv3d vexu hfov avc1 hvc1 "
         b"meta iinf infe iloc iprp ipco ipma grpl ster pitm".split()
     ),
 )

@@ -16,6 +16,7 @@ from jaxtyping import UInt8
 from stereoweave.app.video_outputs import OUTPUTS
 from stereoweave.io.files import replacing
 from stereoweave.rendering.scaling import fit_size, scale_down
+from stereoweave.video.times import format_time
 
 if TYPE_CHECKING:
     from stereoweave.video.converted_frames import ConvertedFrame
@@ -51,8 +52,7 @@ class FramePictures:
     @property
     def shown_time(self) -> str:
         """The time in minutes and seconds, such as 1:02.5 for 62.5 s."""
-        minutes, tenths = divmod(round(10 * self.time_s), 600)
-        return f"{minutes}:{tenths / 10:04.1f}"
+        return format_time(self.time_s)
 
 
 def make_pictures(

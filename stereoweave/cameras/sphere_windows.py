@@ -12,6 +12,7 @@ Panoramic Stereo Imaging" (Peleg, Ben-Ezra, Pritch, IEEE Trans. PAMI 2001) for e
 """
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,7 +39,7 @@ Down = Float32[np.ndarray, "h 1"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Window:
+class Window(ABC):
     """Geometry of a rectified image, which the left and the right image of a pair share.
 
     Attributes:
@@ -58,17 +59,17 @@ class Window:
         down = np.arange(self.size_px[1], dtype=np.float32)[rows, None]
         return (across - self.cx_px) / self.focal_px, (down - self.cy_px) / self.focal_px
 
+    @abstractmethod
     def rays(self, rows: slice = ALL_ROWS) -> Rays:
         """Return the direction of each pixel, of any length, for some rows."""
-        raise NotImplementedError
 
+    @abstractmethod
     def find(self, rays: Rays) -> tuple[Map, Map]:
         """Return the columns and rows of the pixels that show the rays; NaN where none does."""
-        raise NotImplementedError
 
+    @abstractmethod
     def nearness(self, disparity_px: Map) -> Map:
         """Return the left eye's 1 / distance of each pixel along its ray, in 1 / baselines; at least 0."""
-        raise NotImplementedError
 
     def blindness_deg(self, rays: Rays) -> Map:
         """Return the angle of rays from where the baseline is longest; at 90 degrees, none of it is left."""

@@ -1,5 +1,7 @@
 """The command `stereoweave video`."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -24,9 +26,11 @@ from stereoweave.cli.options import (
     replace_old_option,
 )
 from stereoweave.errors import StereoweaveError
+from stereoweave.video.times import PART_S
 
 if TYPE_CHECKING:
     from stereoweave.video.frame_converter import VideoTally
+    from stereoweave.video.job import VideoJob
     from stereoweave.video.reader import StereoVideo
 
 _HIGHEST_RATE = 1000
@@ -47,7 +51,7 @@ Out = Annotated[
         "--out",
         "-o",
         help="Video to write: .mp4, .mov or .mkv. Rerun the same command to resume after an "
-        "interruption, which loses at most 4 s of video.",
+        f"interruption, which loses at most {PART_S} s of video.",
     ),
 ]
 Depth = Annotated[
@@ -163,20 +167,15 @@ def video(  # noqa: PLR0913 - each is an option of the command line
     arrangement: OldFormat = None,
 ) -> None:
     """Convert a stereo video to depth, a new view or a layout. Sound and frame times are kept."""
-    from rich.console import Console
-
     from stereoweave.io.animation import require_video_extra
     from stereoweave.matching.backend import Backend
-    from stereoweave.system.progress import format_duration
     from stereoweave.video.reader import open_video
 
     with require_video_extra("a video"):
-        from stereoweave.video.convert import PART_S, convert_video
         from stereoweave.video.job import VideoJob
-        from stereoweave.video.parts import parts_folder
 
     format = replace_old_option(("--arrangement", arrangement), ("--format", format))
-    try:
+    with _saying_stopped(out):
         job = VideoJob(
             depth=depth,
             depth10=depth10,
@@ -198,16 +197,26 @@ def video(  # noqa: PLR0913 - each is an option of the command line
             rate=None if rate is None else _parse_rate(rate),
             sphere=make_sphere_request(projection, look, fov, lens_fov, whole),
         )
-        whole_count = source.frame_count
-        if length_s is not None:
-            source = _cut_from_middle(source, length_s)
-        if layout:
-            out = _add_mark(out, layout, source.size_px)
+        _convert(source, videos, out, job, length_s)
+
+
+def _convert(
+    video: "StereoVideo", sources: list[Path], out: Path, job: "VideoJob", length_s: float | None
+) -> None:
+    """Convert a video, or this much from its middle, and print what was done."""
+    from rich.console import Console
+
+    from stereoweave.system.progress import format_duration
+    from stereoweave.video.convert import convert_video
+
+    whole_count = video.frame_count
+    if length_s is not None:
+        video = _cut_from_middle(video, length_s)
+    if job.layout:
+        out = _add_mark(out, job.layout, video.size_px)
+    with _saying_stopped(out):
         make_parent_folder(out)
-        tally = convert_video(source, videos, out, job, Console(stderr=True))
-    except KeyboardInterrupt:
-        _print_stopped(out, parts_folder(out), PART_S)
-        raise typer.Exit(130) from None
+        tally = convert_video(video, sources, out, job, Console(stderr=True))
     _print_tally(out, tally)
     if length_s is not None and tally.frames_per_s:
         typer.echo(f"the whole video takes about {format_duration(whole_count / tally.frames_per_s)}")
@@ -256,11 +265,19 @@ def _add_mark(out: Path, layout: str, size_px: tuple[int, int]) -> Path:
     return add_mark(out, layout, StereoPair(left=blank, right=blank), LayoutOptions())
 
 
-def _print_stopped(out: Path, folder: Path, part_s: int) -> None:
-    state = f"no part of {part_s} s was finished; the same command starts from the beginning"
-    if folder.exists():
-        state = f"finished parts are in {folder}; rerun the same command to resume"
-    typer.echo(f"stereoweave: {out}: stopped; {state}", err=True)
+@contextmanager
+def _saying_stopped(out: Path) -> Iterator[None]:
+    """Say what is left of an output whose making is stopped, and how to go on."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        from stereoweave.video.parts import parts_folder
+
+        state = f"no part of {PART_S} s was finished; the same command starts from the beginning"
+        if parts_folder(out).exists():
+            state = f"finished parts are in {parts_folder(out)}; rerun the same command to resume"
+        typer.echo(f"stereoweave: {out}: stopped; {state}", err=True)
+        raise typer.Exit(130) from None
 
 
 def _print_tally(out: Path, tally: "VideoTally") -> None:

@@ -104,8 +104,10 @@ def _print_table(title: str, headings: Sequence[str], rows: Iterable[Sequence[st
 
 
 def _list_depth(numbered: "tuple[int, ShotCheck]") -> list[str]:
+    from stereoweave.video.times import format_time
+
     number, shot = numbered
-    times = _format_seconds(float(shot.start_s)), _format_seconds(float(shot.end_s))
+    times = format_time(shot.start_s), format_time(shot.end_s)
     if shot.depth is None:
         return [str(number), *times, _UNKNOWN, _UNKNOWN, _UNKNOWN, _UNKNOWN]
     near_percent, far_percent = shot.range_percent
@@ -136,12 +138,6 @@ def _list_differences(numbered: "tuple[int, ShotCheck]") -> list[str]:
 
 def _format_number(value: float, form: str) -> str:
     return _UNKNOWN if math.isnan(value) else format(value, form)
-
-
-def _format_seconds(time_s: float) -> str:
-    """Return a time as minutes and seconds, for example 1:02.3 for 62.3 s."""
-    tenths = round(10 * time_s)
-    return f"{tenths // 600}:{tenths // 10 % 60:02}.{tenths % 10}"
 
 
 def _list_facts(found: "VideoCheck", size_px: tuple[int, int]) -> dict[str, object]:

@@ -34,6 +34,10 @@ from stereoweave.cli.options import (
 from stereoweave.errors import Note, StereoweaveError
 
 if TYPE_CHECKING:
+    from stereoweave.matching.backend import Backend
+    from stereoweave.matching.options import MatchOptions
+    from stereoweave.outputs.view_files import ViewFile
+    from stereoweave.pictures.prepare import Prepared
     from stereoweave.rendering.layouts import LayoutOptions
 
 _MIDDLE = 0.5
@@ -133,16 +137,12 @@ def view(  # noqa: PLR0913 - each is an option of the command line
     provider: Provider = "cpu",
 ) -> None:
     """Render a new view of a stereo pair, or a layout of several for 3-D viewers and displays."""
-    from stereoweave.cameras.diagnosis import find_problems
-    from stereoweave.cameras.rectify import crop as crop_to_content
     from stereoweave.matching.backend import Backend
-    from stereoweave.matching.estimate import match
     from stereoweave.matching.options import MatchOptions
-    from stereoweave.outputs.sphere_views import check_whole_view, write_whole_view
+    from stereoweave.outputs.sphere_views import check_extent
     from stereoweave.outputs.view_files import ViewFile
     from stereoweave.pictures.prepare import prepare
     from stereoweave.rendering.layouts import choose_layout, is_converged
-    from stereoweave.system.compiling_ahead import compile_ahead
 
     out = out or _name_view(pictures, layout)
     name = choose_layout(out, layout)
@@ -166,14 +166,26 @@ def view(  # noqa: PLR0913 - each is an option of the command line
     )
     options = MatchOptions(range_px=parse_range_px(range_px), refined=True)
     sphere = make_sphere_request(projection, look, fov, lens_fov, whole)
-    if whole:
-        check_whole_view(file)
+    check_extent(file, whole=whole)
     prepared = prepare(pictures, make_request(format, calib, rectify=rectify, sphere=sphere))
+    _render(file, prepared, Backend(model=model, threads=threads, provider=provider), options, whole)
+
+
+def _render(
+    file: "ViewFile", prepared: "Prepared", backend: "Backend", options: "MatchOptions", whole: bool
+) -> None:
+    """Match a pair, write its views, and print what was written."""
+    from stereoweave.cameras.diagnosis import find_problems
+    from stereoweave.cameras.rectify import crop as crop_to_content
+    from stereoweave.matching.estimate import match
+    from stereoweave.outputs.sphere_views import write_whole_view
+    from stereoweave.system.compiling_ahead import compile_ahead
+
     pair = prepared.pair if whole else crop_to_content(prepared.pair)
     file = file.add_mark(pair)
     make_parent_folder(file.path)
     compile_ahead(*file.rehearsals)
-    estimate = match(Backend(model=model, threads=threads, provider=provider).matcher(), pair, options)
+    estimate = match(backend.matcher(), pair, options)
     if whole:
         written = write_whole_view(file, prepared, estimate)
     else:

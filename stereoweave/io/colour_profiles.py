@@ -8,7 +8,6 @@ import numpy as np
 
 # Colour primaries and transfer curves by their numbers. Other primaries hardly differ from those of sRGB.
 _PRIMARIES = {9: "BT.2020", 12: "Display P3"}
-_BRIGHT_CURVES = {16: "PQ", 18: "HLG"}
 # The white of profiles, as XYZ, and the Bradford matrix, which adapts another one to it (ICC.1, annex E).
 _D50 = (0.9642, 1.0, 0.8249)
 _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
@@ -24,7 +23,6 @@ def make_profile(colours: Mapping[str, Any] | None) -> bytes | None:
     name = _PRIMARIES.get((colours or {}).get("color_primaries", 0))
     if not colours or name is None:
         return None
-    curve = _BRIGHT_CURVES.get(colours.get("transfer_characteristics", 0))
     points = [
         [colours[f"color_primary_{which}_{axis}"] for axis in "xy"] for which in ("red", "green", "blue")
     ]
@@ -33,7 +31,7 @@ def make_profile(colours: Mapping[str, Any] | None) -> bytes | None:
     matrix = matrix * np.linalg.solve(matrix, white)
     adapted = np.diag((_BRADFORD @ _D50) / (_BRADFORD @ white))
     matrix = np.linalg.inv(_BRADFORD) @ adapted @ _BRADFORD @ matrix
-    return _write_profile(f"{name} ({curve}, brightness unchanged)" if curve else name, matrix)
+    return _write_profile(name, matrix)
 
 
 def _to_xyz(x: float, y: float) -> np.ndarray:

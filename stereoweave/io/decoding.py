@@ -102,22 +102,39 @@ def read_picture(path: Path, *, panorama: bool = False) -> DecodedPicture:
 
 def decode(path: str | Path, picture: Image.Image) -> DecodedPicture:
     """Decode an open picture, or the current frame if it has several."""
+    hdr = heif.name_hdr(picture) if picture.format == heif.FORMAT else None
+    if hdr:
+        return _decode_hdr(Path(path), picture, hdr)
     stated_px = picture.size
     with _decoding(path):
         # Load before reading the tags, because loading turns a TIFF upright and updates its orientation tag.
         picture.load()
-    if picture.format == heif.FORMAT and picture.size != stated_px:
-        raise FormatError(
-            f"{path}: expected {_format_size(stated_px)} pixels, as its header states, found "
-            f"{_format_size(picture.size)}",
-            remedy=Remedy("copy it again"),
-        )
+    if picture.format == heif.FORMAT:
+        _check_decoded(path, stated_px, picture.size)
     tags = exif.read_tags(picture)
     if picture.mode.startswith(("I", "F")):
         return DecodedPicture(_to_eight_bits(path, picture), tags, None)
     image, note = _convert_to_srgb(picture)
     with _decoding(path):
         return DecodedPicture(image if image.mode == "RGB" else image.convert("RGB"), tags, note)
+
+
+def _decode_hdr(path: Path, picture: Image.Image, name: str) -> DecodedPicture:
+    """Decode the current picture of an open HEIC file of high dynamic range."""
+    with _decoding(path):
+        image = Image.fromarray(heif.read_hdr(path, picture))
+    _check_decoded(path, picture.size, image.size)
+    return DecodedPicture(image, exif.read_tags(picture), f"HDR ({name}), tone-mapped to SDR (BT.709)")
+
+
+def _check_decoded(path: str | Path, stated_px: tuple[int, int], found_px: tuple[int, int]) -> None:
+    """Raise a FormatError if a decoded picture has another size than its header states."""
+    if stated_px != found_px:
+        raise FormatError(
+            f"{path}: expected {_format_size(stated_px)} pixels, as its header states, found "
+            f"{_format_size(found_px)}",
+            remedy=Remedy("copy it again"),
+        )
 
 
 def decode_values(path: str | Path, picture: Image.Image) -> Shaped[np.ndarray, "h w *channels"]:

@@ -7,14 +7,18 @@ disparity adjustment, so these are read here from the file's boxes (ISO/IEC 1449
 import math
 import re
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+from jaxtyping import UInt8
 from PIL import Image
 
 from stereoweave.errors import FormatError, StereoweaveError, require_extra
 from stereoweave.io import exif
+from stereoweave.io.boxes import Box, find_boxes, split_readable_boxes
+from stereoweave.io.hdr import HDR, WHITE_CODE, map_tones
 
 BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"})
 ENDINGS = frozenset({".heic", ".heif", ".hif"})
@@ -27,6 +31,7 @@ _MOST_BYTES = 500_000_000
 # pictures and their 50 hidden tiles.
 _MOST_META_BYTES = 1_000_000
 _MOST_PICTURES = 20
+_BAND_ROWS = 256
 _MOST_BOXES = 1000  # on the top level of a file
 # Types of items that are no pictures.
 OTHER_ITEMS = frozenset({b"Exif", b"mime", b"uri "})
@@ -38,8 +43,6 @@ _DISPARITY_ADJUSTMENT = bytes.fromhex("de22508536cb436587432f8705e7c78a")
 
 # Flag of a pose with a direction. Without it, the camera looks along the axis of its group.
 _HAS_DIRECTION = 8
-
-_Box = tuple[bytes, bytes]  # its type and its content
 
 
 class _Pose(NamedTuple):
@@ -77,10 +80,12 @@ def read_sizes(path: Path) -> list[tuple[int, int]]:
 
     Those of cropped pictures are among them, because a damaged crop may be larger than its picture.
     """
-    parts = _split_boxes(_read_meta(path)[4:])
-    inner = (_split_boxes(content) for kind, content in parts if kind == b"iprp")
+    parts = split_readable_boxes(_read_meta(path)[4:])
+    inner = (split_readable_boxes(part.content) for part in parts if part.kind == b"iprp")
     sizes_px = []
-    for kind, content in (box for boxes in inner for _, part in boxes for box in _split_boxes(part)):
+    for kind, content, _ in (
+        b for boxes in inner for part in boxes for b in split_readable_boxes(part.content)
+    ):
         if kind == b"ispe" and len(content) >= 12:
             sizes_px.append(struct.unpack_from(">LL", content, 4))
         elif kind == b"clap" and len(content) >= 16:
@@ -93,10 +98,10 @@ def read_sizes(path: Path) -> list[tuple[int, int]]:
 def has_stereo_group(path: Path) -> bool:
     """Return whether a file in boxes, HEIC or AVIF, names two of its pictures a left and a right view."""
     try:
-        parts = dict(_split_boxes(_read_meta(path)[4:]))
+        parts = _read_parts(_read_meta(path)[4:])
     except FormatError:
         return False
-    return any(kind == _STEREO_GROUP.encode() for kind, _ in _split_boxes(parts.get(b"grpl", b"")))
+    return _STEREO_GROUP.encode() in _read_parts(parts.get(b"grpl", b""))
 
 
 def find_views(picture: Any) -> list[int]:
@@ -142,6 +147,35 @@ def read_lens(path: Path, picture: Any) -> exif.Lens | None:
     return lens if lens.is_known else None
 
 
+def name_hdr(picture: Any) -> str | None:
+    """Return the name of the transfer function of an HDR picture, PQ or HLG; None for an ordinary picture."""
+    return HDR.get((picture.info.get("nclx_profile") or {}).get("transfer_characteristics", 0))
+
+
+def read_hdr(path: Path, picture: Any) -> UInt8[np.ndarray, "h w 3"]:
+    """Decode the current picture of an open HDR file with all its bits, and map its tones to sRGB.
+
+    Pillow's pictures have 8 bits, in which the steps of HDR are visible.
+
+    Raises:
+        Exception: The file is damaged; pillow-heif raises SyntaxError, ValueError and others.
+    """
+    from pillow_heif import open_heif
+
+    deep = open_heif(path, convert_hdr_to_8bit=False)[picture.tell()]
+    stored = np.asarray(deep)
+    colours, bits = deep.info["nclx_profile"], deep.info["bit_depth"]
+    # pillow-heif shifts the bits of deep pictures up to the 16th.
+    white = 255 if stored.dtype == np.uint8 else ((1 << bits) - 1) << 16 - bits
+    channels = stored[..., :3] if stored.ndim == 3 else np.broadcast_to(stored[..., None], (*stored.shape, 3))
+    shown = np.empty(channels.shape, np.uint8)
+    for start in range(0, len(shown), _BAND_ROWS):  # light takes 12 bytes a pixel
+        rows = slice(start, start + _BAND_ROWS)
+        codes = np.rint(channels[rows] * np.float32(WHITE_CODE / white)).astype(np.uint16)
+        shown[rows] = map_tones(codes, colours["transfer_characteristics"], colours["color_primaries"])
+    return shown
+
+
 def _check_meta(path: Path, meta: bytes) -> None:
     """Raise a ValueError if the contents of the box `meta` are missing, a FormatError for many pictures."""
     if not meta:
@@ -172,9 +206,9 @@ def _find_stereo_group(picture: Any) -> dict[str, Any] | None:
     return None
 
 
-def _read_pose(properties: Sequence[_Box]) -> _Pose | None:
+def _read_pose(properties: Sequence[Box]) -> _Pose | None:
     """Return a camera's pose from its extrinsic matrix; None if the file has none that is undamaged."""
-    content = next((content for kind, content in properties if kind in _EXTRINSICS), b"")
+    content = next((content for kind, content, _ in properties if kind in _EXTRINSICS), b"")
     flags = int.from_bytes(content[:4])
     axes = [axis for axis in range(3) if flags >> axis & 1]
     end = 4 + 4 * len(axes)
@@ -185,20 +219,20 @@ def _read_pose(properties: Sequence[_Box]) -> _Pose | None:
     return _Pose((x, y, z), (bool(flags & _HAS_DIRECTION), content[end:]))
 
 
-def _read_adjustment(properties: Sequence[_Box]) -> float | None:
+def _read_adjustment(properties: Sequence[Box]) -> float | None:
     """Return the disparity adjustment as a share of the picture's width; None if there is none."""
-    for kind, content in properties:
+    for kind, content, _ in properties:
         if kind == _DISPARITY_ADJUSTMENT and len(content) == 4:
             share = struct.unpack(">l", content)[0] / 10_000
             return share if abs(share) <= 1 else None
     return None
 
 
-def _read_properties(meta: bytes, items: Sequence[int]) -> list[list[_Box]]:
+def _read_properties(meta: bytes, items: Sequence[int]) -> list[list[Box]]:
     """Return the properties of each item, from the contents of the box `meta`; damaged ones are left out."""
-    parts = dict(_split_boxes(dict(_split_boxes(meta[4:])).get(b"iprp", b"")))
-    shared, table = list(_split_boxes(parts.get(b"ipco", b""))), parts.get(b"ipma", b"")
-    found: dict[int, list[_Box]] = {}
+    parts = _read_parts(_read_parts(meta[4:]).get(b"iprp", b""))
+    shared, table = list(split_readable_boxes(parts.get(b"ipco", b""))), parts.get(b"ipma", b"")
+    found: dict[int, list[Box]] = {}
     try:
         head, count = struct.unpack_from(">LL", table)
         item_format, place_format = (">LB" if head >> 24 else ">HB"), ("H" if head & 1 else "B")
@@ -216,53 +250,31 @@ def _read_properties(meta: bytes, items: Sequence[int]) -> list[list[_Box]]:
     return [found.get(item, []) for item in items]
 
 
-def _split_boxes(content: bytes) -> Iterator[_Box]:
-    """Yield the boxes that follow one another; a box with an identifier has this as its type."""
-    start = 0
-    while start + 8 <= len(content):
-        size, kind = struct.unpack_from(">L4s", content, start)
-        begin = start + 8
-        if size == 1:
-            size, begin = int.from_bytes(content[begin : begin + 8]), begin + 8
-        if kind == b"uuid":
-            kind, begin = content[begin : begin + 16], begin + 16
-        end = start + size if size else len(content)
-        if end < begin or end > len(content):
-            return
-        yield kind, content[begin:end]
-        start = end
+def _read_parts(content: bytes) -> dict[bytes, bytes]:
+    """Return the contents of boxes by their types."""
+    return {box.kind: box.content for box in split_readable_boxes(content)}
 
 
 def _read_meta(path: Path) -> bytes:
-    """Return the contents of a file's box `meta`; empty if there is none, or several.
+    """Return the contents of a file's box `meta`; empty if there is none, or several, or a damaged box.
 
     Of several, which the standard rules out, libheif may use another one.
 
     Raises:
         FormatError: The box is larger than 1 MB.
     """
-    found = b""
     with path.open("rb") as file:
-        end = path.stat().st_size
-        for _ in range(_MOST_BOXES):
-            start = file.tell()
-            if start == end:
-                return found
-            head = file.read(16)
-            size, kind, long_size = struct.unpack(">L4sQ", head.ljust(16, b"\0"))
-            begin = 16 if size == 1 else 8
-            size = long_size if size == 1 else size or end - start
-            if size < begin or start + size > end:
-                return b""
-            if kind == b"meta":
-                if found:
-                    return b""
-                if size > _MOST_META_BYTES:
-                    raise FormatError(
-                        f"{path}: expected a HEIC picture whose box 'meta' is at most 1 MB, found "
-                        f"{size / 1e6:.1f} MB; save it again without its colour profile"
-                    )
-                file.seek(start + begin)
-                found = file.read(size - begin)
-            file.seek(start + size)
-    return b""
+        try:
+            places = [place for place in find_boxes(file, _MOST_BOXES) if place.kind == b"meta"]
+        except FormatError:
+            return b""
+        if len(places) != 1:
+            return b""
+        [meta] = places
+        if meta.end - meta.start > _MOST_META_BYTES:
+            raise FormatError(
+                f"{path}: expected a HEIC picture whose box 'meta' is at most 1 MB, found "
+                f"{(meta.end - meta.start) / 1e6:.1f} MB; save it again without its colour profile"
+            )
+        file.seek(meta.begin)
+        return file.read(meta.end - meta.begin)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from stereoweave.cameras.sphere_merge import MatchedWindow, merge_windows
+from stereoweave.cameras.sphere_nearness import MatchedWindow, spread_nearness
 from stereoweave.cameras.sphere_windows import BLIND_DEG
 from stereoweave.errors import Note, StereoweaveError
 from stereoweave.io.colormap import colour_disparity, find_colour_range_px, grey_confidence
@@ -78,12 +78,12 @@ def measure_sphere(prepared: Prepared, estimate: Estimate) -> SphereDepth:
     matched = MatchedWindow(
         view.window, view.window.nearness(estimate.disparity_px), estimate.confidence, pair.left_seen
     )
-    merged = merge_windows([matched], view.whole_projection, view.whole_size_px)
+    found = spread_nearness(matched, view.whole_projection, view.whole_size_px)
     with np.errstate(divide="ignore"):
-        distance = (prepared.baseline_m or 1.0) / merged.nearness
+        distance = (prepared.baseline_m or 1.0) / found.nearness
     return SphereDepth(
         distance=distance.astype(np.float32),
-        confidence=merged.confidence,
+        confidence=found.confidence,
         left=spread_views(view.spreader(), pair.left, None),
         unit="baselines" if prepared.baseline_m is None else "m",
     )

@@ -19,8 +19,18 @@ from stereoweave.system.steps import step
 _OF_BOTH = "side_by_side"
 
 
-def check_whole_view(file: ViewFile) -> None:
-    """Raise a StereoweaveError if a file of views cannot show the whole field of view."""
+def check_extent(file: ViewFile, *, whole: bool) -> None:
+    """Raise a StereoweaveError if a file of views cannot show the whole field of view, or a window."""
+    if not whole and is_vr180_name(file.path):
+        raise StereoweaveError(
+            f"{file.path}: expected the whole field of view for a VR180 photo, found a window",
+            remedy=Remedy("take the whole, or name the file otherwise", ("whole",)),
+        )
+    if whole:
+        _check_whole(file)
+
+
+def _check_whole(file: ViewFile) -> None:
     check_whole_layout(file.name)
     if is_vr180_name(file.path) and file.name != _OF_BOTH:
         raise StereoweaveError(

@@ -1,11 +1,11 @@
-"""Decoded frames as 8-bit RGB: matrix and range of their colours, and tone mapping of HDR."""
+"""Decoded frames as 8-bit RGB: matrix and range of their colours; HDR is tone-mapped."""
 
-from functools import cache
 from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
-from jaxtyping import Float32, UInt8, UInt16
+from jaxtyping import Float32, UInt8
+
+from stereoweave.io.hdr import HDR, WHITE_CODE, map_tones
 
 if TYPE_CHECKING:
     import av
@@ -15,31 +15,16 @@ _HD_WIDTH_PX, _HD_HEIGHT_PX = 1280, 577
 _BT709, _BT601, _BT2020, _FULL_RANGE = 1, 5, 9, 2  # av.video.reformatter's Colorspace and ColorRange
 _UNTAGGED = 0, 2  # AVCOL_SPC_RGB, which some encoders write for "unknown", and AVCOL_SPC_UNSPECIFIED
 
-# AVColorTransferCharacteristic of HDR, and AVCOL_PRI_BT709.
-_PQ, _HLG = 16, 18
-_HDR = {_PQ: "PQ", _HLG: "HLG"}
-_PRIMARIES_BT709, _PRIMARIES_BT2020 = 1, 9
+_PRIMARIES_BT2020 = 9
 
-# Luminance of a white surface and of the brightest highlights (ITU-R BT.2408). The first becomes SDR's peak.
-_WHITE_NITS, _PEAK_NITS = 203.0, 1000.0
-_PQ_PEAK_NITS = 10_000.0
-# ITU-R BT.2087: linear RGB of BT.2020 to that of BT.709.
-_BT2020_TO_BT709 = np.array(
-    [[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]], np.float32
-)
-_LUMA_BT2020 = np.array([[0.2627, 0.6780, 0.0593]], np.float32)
 # To rgb48le, FFmpeg converts some dark colours of 4:2:0 wrongly.
 _DEEP_RGB = "gbrp16le"
-# FFmpeg's conversion to 16-bit RGB makes this of white; it rounds to 65283.
-_WHITE_CODE = 255 * 256
-_HLG_GAMMA = 1.2  # of a display with the peak above
-_GAINS = 4096
 
 
 def convert_to_rgb(frame: "av.VideoFrame") -> UInt8[np.ndarray, "h w 3"]:
     """Return a frame upright, as sRGB. HDR is tone-mapped."""
-    if frame.color_trc in _HDR:
-        picture = _map_tones(_decode_rgb(frame, _DEEP_RGB), frame.color_trc, frame.color_primaries)
+    if frame.color_trc in HDR:
+        picture = map_tones(_decode_rgb(frame, _DEEP_RGB), frame.color_trc, frame.color_primaries)
     else:
         picture = _decode_rgb(frame, "rgb24")
     return np.ascontiguousarray(np.rot90(picture, frame.rotation // 90))
@@ -48,13 +33,13 @@ def convert_to_rgb(frame: "av.VideoFrame") -> UInt8[np.ndarray, "h w 3"]:
 def convert_to_fine(frame: "av.VideoFrame") -> Float32[np.ndarray, "h w 3"]:
     """Return a frame upright, as RGB in the file's own colours, HDR too; black is 0 and white 255."""
     codes = _decode_rgb(frame, _DEEP_RGB).astype(np.float32)
-    codes *= 255 / _WHITE_CODE
+    codes *= 255 / WHITE_CODE
     return np.ascontiguousarray(np.rot90(codes, frame.rotation // 90))
 
 
 def name_hdr(frame: "av.VideoFrame") -> str | None:
     """Return the name of a frame's HDR transfer function, PQ or HLG; None for an ordinary frame."""
-    return _HDR.get(frame.color_trc)
+    return HDR.get(frame.color_trc)
 
 
 def hdr_colours(frame: "av.VideoFrame") -> tuple[int, int, int] | None:
@@ -62,7 +47,7 @@ def hdr_colours(frame: "av.VideoFrame") -> tuple[int, int, int] | None:
 
     Primaries that the file does not state are those of BT.2020.
     """
-    if frame.color_trc not in _HDR:
+    if frame.color_trc not in HDR:
         return None
     primaries = _PRIMARIES_BT2020 if frame.color_primaries in _UNTAGGED else frame.color_primaries
     return primaries, frame.color_trc, _BT2020
@@ -82,73 +67,6 @@ def _decode_rgb(frame: "av.VideoFrame", format: str) -> np.ndarray:
 
 
 def _guess_matrix(frame: "av.VideoFrame") -> int:
-    if frame.color_trc in _HDR:
+    if frame.color_trc in HDR:
         return _BT2020
     return _BT709 if frame.width >= _HD_WIDTH_PX or frame.height >= _HD_HEIGHT_PX else _BT601
-
-
-def _map_tones(
-    codes: UInt16[np.ndarray, "h w 3"], transfer: int, primaries: int
-) -> UInt8[np.ndarray, "h w 3"]:
-    """Return HDR as sRGB whose white is a white surface.
-
-    The brightest channel of each pixel is compressed by the curve of ITU-R BT.2390, and the others in
-    proportion, which keeps the hue. Colours outside BT.709 are clipped.
-    """
-    light = _linear_table(transfer)[codes]
-    if transfer == _HLG:
-        luminance = cv2.transform(light, _LUMA_BT2020)
-        light *= np.power(luminance, _HLG_GAMMA - 1)[..., None]
-    # The fourth root spaces the entries about evenly in perceived brightness.
-    steps = np.sqrt(np.sqrt(light.max(axis=2))) * (_GAINS - 1) + 0.5
-    light *= _gain_table()[np.minimum(steps, _GAINS - 1).astype(np.uint16)][..., None]
-    if primaries != _PRIMARIES_BT709:
-        light = cv2.transform(light, _BT2020_TO_BT709)
-    return _srgb_table()[(np.clip(light, 0, 1) * 65535 + 0.5).astype(np.uint16)]
-
-
-@cache
-def _linear_table(transfer: int) -> Float32[np.ndarray, "65536"]:
-    """Return the light of each 16-bit code: of the display for PQ, of the scene for HLG; 1 is the peak."""
-    codes = np.minimum(np.arange(65536) / _WHITE_CODE, 1)
-    if transfer == _PQ:
-        return np.minimum(_decode_pq(codes) / _PEAK_NITS, 1).astype(np.float32)
-    a = 0.17883277
-    b, c = 1 - 4 * a, 0.5 - a * np.log(4 * a)
-    return np.where(codes <= 0.5, codes**2 / 3, (np.exp((codes - c) / a) + b) / 12).astype(np.float32)
-
-
-@cache
-def _gain_table() -> Float32[np.ndarray, "4096"]:
-    """Return the factor from light relative to HDR's peak to light relative to SDR's, at fourth roots."""
-    light = np.maximum(np.arange(_GAINS) / (_GAINS - 1), 0.5 / _GAINS) ** 4
-    peak, white = _encode_pq(np.array([_PEAK_NITS, _WHITE_NITS]))
-    code, most = _encode_pq(light * _PEAK_NITS) / peak, white / peak
-    knee = 1.5 * most - 0.5
-    t = np.maximum(code - knee, 0) / (1 - knee)
-    spline = (
-        (2 * t**3 - 3 * t**2 + 1) * knee + (t**3 - 2 * t**2 + t) * (1 - knee) + (3 * t**2 - 2 * t**3) * most
-    )
-    nits = _decode_pq(np.where(code < knee, code, spline) * peak)
-    return (nits / _WHITE_NITS / light).astype(np.float32)
-
-
-@cache
-def _srgb_table() -> UInt8[np.ndarray, "65536"]:
-    light = np.arange(65536) / 65535
-    code = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
-    return np.rint(255 * code).astype(np.uint8)
-
-
-# SMPTE ST 2084.
-_M1, _M2, _C1, _C2, _C3 = 0.1593017578125, 78.84375, 0.8359375, 18.8515625, 18.6875
-
-
-def _encode_pq(nits: np.ndarray) -> np.ndarray:
-    power = (nits / _PQ_PEAK_NITS) ** _M1
-    return ((_C1 + _C2 * power) / (1 + _C3 * power)) ** _M2
-
-
-def _decode_pq(code: np.ndarray) -> np.ndarray:
-    power = code ** (1 / _M2)
-    return _PQ_PEAK_NITS * (np.maximum(power - _C1, 0) / (_C2 - _C3 * power)) ** (1 / _M1)

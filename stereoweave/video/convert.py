@@ -15,6 +15,7 @@ from rich.progress import Progress
 from stereoweave import __version__
 from stereoweave.errors import Remedy, StereoweaveError
 from stereoweave.io.output_lock import lock_output
+from stereoweave.matching.edge_vote.vote import rehearse_voting
 from stereoweave.pictures.panoramas import NO_SPHERE
 from stereoweave.rendering.rehearsals import rehearse_drawing, rehearse_filling, rehearse_fine_drawing
 from stereoweave.system.compiling_ahead import Rehearsal, compile_ahead
@@ -24,12 +25,13 @@ from stereoweave.video.carried_frames import rehearse_carrying
 from stereoweave.video.depth_codes import describe_values, find_losses
 from stereoweave.video.frame_converter import FrameConverter, VideoTally, load_matcher
 from stereoweave.video.job import VideoJob
-from stereoweave.video.layout_marks import find_baseline_m, mark_layout
+from stereoweave.video.layout_marks import PACKED, find_baseline_m, mark_layout
 from stereoweave.video.mp4_marks import VideoMarks
 from stereoweave.video.parts import open_parts
-from stereoweave.video.reader import StereoVideo, format_time
+from stereoweave.video.reader import StereoVideo
 from stereoweave.video.sphere_output import WholeOutput
 from stereoweave.video.survey import survey_video
+from stereoweave.video.times import PART_S, format_time
 from stereoweave.video.tracks import list_picture_files
 from stereoweave.video.writer import (
     BT709,
@@ -39,22 +41,10 @@ from stereoweave.video.writer import (
     HEVC10,
     Colours,
     Encoding,
-    Packing,
     Picture,
     Recorder,
     check_container,
 )
-
-# Length of a part, which begins with a key frame. An interrupted run loses only the unfinished part.
-PART_S = 4
-
-PACKINGS = {
-    "side_by_side": Packing("left_right", 3),
-    "side_by_side_half": Packing("left_right", 3),
-    "crossed": Packing("right_left", None),
-    "top_bottom": Packing("top_bottom", 4),
-    "top_bottom_half": Packing("top_bottom", 4),
-}
 
 
 def convert_video(
@@ -81,7 +71,7 @@ def convert_video(
     _check_output(out, job, video, sources)
     job = fit_to_sphere(job, video)
     matcher = load_matcher(job)
-    compile_ahead(rehearse_carrying, *_list_rehearsals(job))
+    compile_ahead(*_list_rehearsals(job))
     if job.is_fine:
         video.read_fine()
     recorder = _make_recorder(job, video)
@@ -93,7 +83,8 @@ def convert_video(
         if parts.files:
             converter = FrameConverter.from_state(job, parts.state(), video.size_px)
             done_s = converter.tally.frames / video.rate
-            _print_line(console, f"{out.name}: resuming at {format_time(Fraction(round(done_s)))[:-4]}")
+            resumed = format_time(done_s, decimals=0, hours=True)
+            _print_line(console, f"{out.name}: resuming at {resumed}")
         else:
             survey, notes = survey_video(
                 video, matcher, bar, rectified=job.rectify, threads=job.backend.threads
@@ -120,7 +111,7 @@ def _make_recorder(job: VideoJob, video: StereoVideo) -> Recorder:
         time_base=video.time_base,
         # FFmpeg stores numerators and denominators in 32 bits.
         rate=video.rate.limit_denominator(100_000),
-        packing=PACKINGS.get(job.layout or ""),
+        packing=PACKED[job.layout].declared if job.layout in PACKED else None,
         colours=Colours(*video.hdr_colours) if job.is_fine and video.hdr_colours else BT709,
         threads=thread_count(job.backend.threads),
     )
@@ -135,9 +126,13 @@ def _choose_encoding(job: VideoJob) -> Encoding:
 
 
 def _list_rehearsals(job: VideoJob) -> tuple[Rehearsal, ...]:
-    if job.depth or job.depth10 or job.depth16:
+    """Return rehearsals of the kernels of a conversion; none if it only joins the frames of both cameras."""
+    if job.join and not job.on_converted:
         return ()
-    return (rehearse_fine_drawing,) if job.is_fine else (rehearse_drawing, rehearse_filling)
+    depth = rehearse_carrying, rehearse_voting
+    if job.depth or job.depth10 or job.depth16:
+        return depth
+    return (*depth, rehearse_fine_drawing) if job.is_fine else (*depth, rehearse_drawing, rehearse_filling)
 
 
 def fit_to_sphere(job: VideoJob, video: StereoVideo) -> VideoJob:

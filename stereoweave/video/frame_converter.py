@@ -22,11 +22,12 @@ from stereoweave.video.converted_frames import ConvertedFrame
 from stereoweave.video.frame_groups import MATCHED_EVERY, FrameGroup, FrameGrouper
 from stereoweave.video.frame_renderer import FrameRenderer
 from stereoweave.video.job import VideoJob
-from stereoweave.video.reader import StereoFrame, format_time
+from stereoweave.video.reader import StereoFrame
 from stereoweave.video.shot_alignment import ShotAligner
 from stereoweave.video.squeezing import squeeze_job
 from stereoweave.video.survey import Survey
 from stereoweave.video.temporal_filter import TemporalFilter
+from stereoweave.video.times import format_frame_time
 from stereoweave.video.writer import Picture
 
 _NAMED_PROBLEMS = 3
@@ -57,7 +58,7 @@ class VideoTally:
         if frame.problem is not None:
             self.problems += 1
             if len(self.named) < _NAMED_PROBLEMS:
-                self.named.append(f"{format_time(frame.time)} {frame.problem}")
+                self.named.append(f"{format_frame_time(frame.time)} {frame.problem}")
 
 
 def load_matcher(job: VideoJob) -> Matcher:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from stereoweave.stereo import StereoPair
-from stereoweave.video.motion import CUT_SHARE, convert_to_grey, halve, measure_motion
+from stereoweave.video.cuts import begins_shot, make_small_grey
 from stereoweave.video.reader import StereoFrame
 from stereoweave.video.shot_alignment import ShotAligner
 
@@ -37,7 +37,7 @@ class FrameGrouper:
 
     Args:
         aligner: Aligner of the frames; None to leave them as they are.
-        last_grey: Left image of the last frame, as read, grey and at half size; None at the start.
+        last_grey: The last frame's left image, as read, from `make_small_grey`; None at the start.
 
     Attributes:
         cuts: Number of shots that followed another one so far.
@@ -54,8 +54,8 @@ class FrameGrouper:
         """Yield the frames in groups. The last frame ends a group, so that it is matched in any case."""
         iterator = iter(frames)
         while several := list(islice(iterator, 1 if self._last_grey is None else MATCHED_EVERY)):
-            grey = _make_thumbnail(several[-1])
-            if len(several) > 1 and not self._begins_shot(grey):
+            grey = make_small_grey(several[-1].left)
+            if len(several) > 1 and not begins_shot(self._last_grey, grey):
                 self._last_grey = grey
                 yield _make_group([self._align(frame) for frame in several])
                 continue
@@ -88,19 +88,14 @@ class FrameGrouper:
 
     def _begin(self, frame: StereoFrame) -> tuple[StereoFrame, StereoPair]:
         """Return a frame and its aligned pair; if the frame begins a shot, its rows are measured."""
-        grey = _make_thumbnail(frame)
-        if self._last_grey is not None and self._begins_shot(grey):
+        grey = make_small_grey(frame.left)
+        if self._last_grey is not None and begins_shot(self._last_grey, grey):
             self.cuts += 1
             self._first_times.add(frame.time)
             if self._aligner:
                 self._aligner.begin_shot()
         self._last_grey = grey
         return self._align(frame)
-
-    def _begins_shot(self, grey: UInt8[np.ndarray, "h w"]) -> bool:
-        if self._last_grey is None or self._last_grey.shape != grey.shape:
-            return True
-        return measure_motion(self._last_grey, grey).explained_share < CUT_SHARE
 
     def _align(self, frame: StereoFrame) -> tuple[StereoFrame, StereoPair]:
         pair = StereoPair(left=frame.left, right=frame.right)
@@ -112,7 +107,3 @@ class FrameGrouper:
 
 def _make_group(aligned: Sequence[tuple[StereoFrame, StereoPair]]) -> FrameGroup:
     return FrameGroup([frame for frame, _ in aligned], [pair for _, pair in aligned])
-
-
-def _make_thumbnail(frame: StereoFrame) -> UInt8[np.ndarray, "h w"]:
-    return halve(convert_to_grey(frame.left))

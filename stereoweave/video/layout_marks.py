@@ -1,17 +1,29 @@
 """Marks of a film of a layout, from what is known about the cameras of its views."""
 
 from math import atan, degrees
+from typing import NamedTuple
 
 from stereoweave.stereo import StereoCamera
 from stereoweave.video.mp4_marks import MOST_BASELINE_M, VideoMarks
+from stereoweave.video.writer import Packing
 
-# The packing of each layout with one view for each eye, and whether the right view comes first.
+
+class LayoutPacking(NamedTuple):
+    """How a layout holds one view for each eye: as `VideoMarks` say it, and as its stream declares it."""
+
+    packing: str
+    right_first: bool
+    declared: Packing
+
+
+_BESIDE = LayoutPacking("side_by_side", False, Packing("left_right", 3))
+_ABOVE = LayoutPacking("top_bottom", False, Packing("top_bottom", 4))
 PACKED = {
-    "side_by_side": ("side_by_side", False),
-    "side_by_side_half": ("side_by_side", False),
-    "crossed": ("side_by_side", True),
-    "top_bottom": ("top_bottom", False),
-    "top_bottom_half": ("top_bottom", False),
+    "side_by_side": _BESIDE,
+    "side_by_side_half": _BESIDE,
+    "crossed": LayoutPacking("side_by_side", True, Packing("right_left", None)),
+    "top_bottom": _ABOVE,
+    "top_bottom_half": _ABOVE,
 }
 
 
@@ -45,7 +57,7 @@ def mark_layout(
     """
     if layout not in PACKED:
         return None
-    packing, right_first = PACKED[layout]
+    packing, right_first, _ = PACKED[layout]
     if camera is None:
         return VideoMarks(packing=packing, right_first=right_first)
     return VideoMarks(

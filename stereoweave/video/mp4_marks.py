@@ -5,18 +5,13 @@ Media File Formats and Spatial and Immersive Media". PyAV cannot set them, so th
 descriptions (ISO/IEC 14496-12) of a finished file.
 """
 
-import os
-import shutil
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
 
 from stereoweave.errors import FormatError, StereoweaveError
-from stereoweave.io.boxes import Box, change_boxes, make_box, make_full_box, split_boxes
-from stereoweave.io.files import replacing
+from stereoweave.io.boxes import Box, Place, change_boxes, find_boxes, make_box, make_full_box, split_boxes
 
 # stereo_mode of `st3d`, without and with the right view first; None where the RFC has no number. Then the
 # packing kind of `pkin`.
@@ -47,10 +42,6 @@ _OPTIONAL = frozenset({b"clap", b"pasp", b"colr", b"fiel", b"btrt", b"chrm", b"g
 # Bytes of a visual sample description, and of `stsd`, before their boxes.
 _ENTRY_BYTES, _STSD_BYTES = 78, 8
 _TABLE = b"mdia", b"minf", b"stbl"
-# Boxes on the top level that state no place in the file.
-_PLACELESS = frozenset({b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot", b"uuid", b"udta"})
-# Boxes within the index that do: of encrypted samples, and of items such as pictures.
-_PLACES_IN_INDEX = b"saio", b"iloc"
 # The index of ten hours at 60 frames a second with sound has about 60 MB.
 _MOST_INDEX_BYTES = 500_000_000
 _MOST_BOXES = 100_000  # on the top level of a file
@@ -69,7 +60,6 @@ class VideoMarks:
             an equirectangular picture.
         vertical_field_of_view_deg: Vertical angle of an equirectangular view; None for 180 degrees.
         baseline_m: Distance of the cameras; None if unknown.
-        adjustment_percent: Shift of the views against each other that players apply, in percent of the width.
     """
 
     packing: str | None = None
@@ -78,7 +68,6 @@ class VideoMarks:
     field_of_view_deg: float | None = None
     vertical_field_of_view_deg: float | None = None
     baseline_m: float | None = None
-    adjustment_percent: float = 0.0
 
     def __post_init__(self) -> None:
         for name, value, known in (
@@ -96,10 +85,6 @@ class VideoMarks:
         ):
             if number is not None and not 0 < number <= most:
                 raise StereoweaveError(f"{name}: expected above 0 and at most {most:g}, found {number}")
-        if not abs(self.adjustment_percent) <= 100:
-            raise StereoweaveError(
-                f"adjustment_percent: expected -100 to 100 percent, found {self.adjustment_percent}"
-            )
 
     @property
     def is_panorama(self) -> bool:
@@ -107,39 +92,25 @@ class VideoMarks:
         return self.projection in _COVERED_DEG
 
 
-class _Place(NamedTuple):
-    """Where a box of the top level starts and ends in its file."""
-
-    kind: bytes
-    start: int
-    end: int
-
-
 def write_marks(path: Path, marks: VideoMarks) -> None:
     """Write the marks into the first video track of a finished MP4 or MOV file; earlier marks are replaced.
 
-    Pictures, sound and times stay as they are. A file with its index at the end is changed in place, so
-    that nobody else should read it yet.
+    Pictures, sound and times stay as they are. The file is changed in place, so that nobody else should read
+    it yet.
 
     Raises:
-        FormatError: The file is damaged, has no index, no video track or several of them, or consists of
-            fragments.
+        FormatError: The file is damaged, has no index or one that is not its last box, no video track or
+            several of them, or consists of fragments.
     """
     try:
         with path.open("r+b") as file:
-            places = list(_find_places(file))
+            places = list(find_boxes(file, _MOST_BOXES))
             index = _find_index(places)
             file.seek(index.start)
-            old = file.read(index.end - index.start)
-            if index is places[-1]:
-                new = mark_index(old, marks)
-                file.seek(index.start)
-                file.write(new)
-                file.truncate()
-                return
-            _check_movable(places, old)
-            new = mark_index(old, marks, moved_from=index.end)
-        _replace_index(path, index, new)
+            new = mark_index(file.read(), marks)
+            file.seek(index.start)
+            file.write(new)
+            file.truncate()
     except FormatError as error:
         raise error.with_prefix(f"{path}: ") from error
     except OSError as error:
@@ -162,14 +133,12 @@ def show_bounds(marks: VideoMarks) -> VideoMarks:
     )
 
 
-def mark_index(index: bytes, marks: VideoMarks, *, moved_from: int | None = None) -> bytes:
+def mark_index(index: bytes, marks: VideoMarks) -> bytes:
     """Return the box `moov` with the marks in its video track.
 
     Args:
         index: The whole box.
         marks: What to mark; marks that are there already are replaced.
-        moved_from: Place in the file from which on all media data moves by as much as the box grows. None if
-            the box is the last one.
 
     Raises:
         FormatError: The box is damaged, or has no video track or several.
@@ -186,14 +155,7 @@ def mark_index(index: bytes, marks: VideoMarks, *, moved_from: int | None = None
             "write the file again with one video track"
         )
     boxes = make_boxes(marks)
-    new = make_box(b"moov", change_boxes(moov.content, (b"trak",), lambda track: _mark_track(track, boxes)))
-    if moved_from is None:
-        return new
-    grown = len(new) - len(index)
-    for kind, number in ((b"stco", "I"), (b"co64", "Q")):
-        move = partial(_move_chunks, number=number, moved_from=moved_from, by=grown)
-        new = change_boxes(new, (b"moov", b"trak", *_TABLE, kind), move)
-    return new
+    return make_box(b"moov", change_boxes(moov.content, (b"trak",), lambda track: _mark_track(track, boxes)))
 
 
 def make_boxes(marks: VideoMarks) -> tuple[bytes, bytes]:
@@ -226,9 +188,6 @@ def _make_eyes(marks: VideoMarks) -> bytes:
     parts = make_full_box(b"stri", bytes([views])) + make_full_box(b"hero", bytes([_LEFT_IS_HERO]))
     if marks.baseline_m:
         parts += make_box(b"cams", make_full_box(b"blin", struct.pack(">I", round(1e6 * marks.baseline_m))))
-    if marks.adjustment_percent:
-        adjustment = struct.pack(">i", round(100 * marks.adjustment_percent))
-        parts += make_box(b"cmfy", make_full_box(b"dadj", adjustment))
     return make_box(b"eyes", parts)
 
 
@@ -286,45 +245,7 @@ def _is_video(track: bytes) -> bool:
     )
 
 
-def _move_chunks(table: bytes, number: str, moved_from: int, by: int) -> bytes:
-    """Return the content of `stco` or `co64` after the chunks from a place on moved."""
-    count, size = int.from_bytes(table[4:8]), struct.calcsize(number)
-    if len(table) < 8 + count * size:
-        raise FormatError("expected a table of chunks in the index, found one cut off; write the file again")
-    places = struct.unpack_from(f">{count}{number}", table, 8)
-    moved = [place + by if place >= moved_from else place for place in places]
-    if moved and max(moved) >= 1 << 8 * size:
-        raise FormatError("expected a file below 4 GB, or with its index at the end; write the file again")
-    return table[:8] + struct.pack(f">{count}{number}", *moved) + table[8 + count * size :]
-
-
-def _find_places(file: BinaryIO) -> Iterator[_Place]:
-    """Yield the boxes on the top level of a file.
-
-    Raises:
-        FormatError: One of them is damaged or cut off, or there are very many.
-    """
-    total = os.fstat(file.fileno()).st_size
-    start = 0
-    for _ in range(_MOST_BOXES):
-        if start == total:
-            return
-        file.seek(start)
-        size, kind, long_size = struct.unpack(">I4sQ", file.read(16).ljust(16, b"\0"))
-        head = 16 if size == 1 else 8
-        # A size of 0 stands for the rest of the file.
-        size = {0: total - start, 1: long_size}.get(size, size)
-        if size < head or start + size > total:
-            raise FormatError(
-                f"expected whole boxes, found {kind!r} with {size} bytes of which the file holds "
-                f"{total - start}; record or write the file again"
-            )
-        yield _Place(kind, start, start + size)
-        start += size
-    raise FormatError(f"expected at most {_MOST_BOXES} boxes, found more; write the file again")
-
-
-def _find_index(places: Sequence[_Place]) -> _Place:
+def _find_index(places: Sequence[Place]) -> Place:
     kinds = {place.kind for place in places}
     if b"moof" in kinds:
         raise FormatError(
@@ -333,6 +254,11 @@ def _find_index(places: Sequence[_Place]) -> _Place:
     found = [place for place in places if place.kind == b"moov"]
     if len(found) != 1:
         raise FormatError(f"expected one index (moov), found {len(found) or 'none'}; write the file again")
+    if found[0] is not places[-1]:
+        # The tables of an index count from the start of the file, so media data must not move.
+        raise FormatError(
+            "expected the index (moov) at the end, found it before other boxes; write the file again"
+        )
     size_bytes = found[0].end - found[0].start
     if size_bytes > _MOST_INDEX_BYTES:
         raise FormatError(
@@ -340,29 +266,3 @@ def _find_index(places: Sequence[_Place]) -> _Place:
             f"{size_bytes // 1_000_000} MB; write the file again"
         )
     return found[0]
-
-
-def _check_movable(places: Sequence[_Place], index: bytes) -> None:
-    """Raise FormatError if more than the tables of chunks names places, so that no data can be moved."""
-    others = [repr(kind) for kind in sorted({place.kind for place in places} - _PLACELESS)]
-    others += [repr(kind) for kind in _PLACES_IN_INDEX if kind in index]
-    if others:
-        raise FormatError(
-            f"expected an index that alone names places in the file, found {', '.join(others)}; "
-            "write the file again with its index at the end"
-        )
-
-
-def _replace_index(path: Path, index: _Place, new: bytes) -> None:
-    """Write the file again, with another index in its place."""
-    with replacing(path) as temporary, path.open("rb") as old, temporary.open("wb") as file:
-        _copy_bytes(old, file, index.start)
-        file.write(new)
-        old.seek(index.end)
-        shutil.copyfileobj(old, file)
-
-
-def _copy_bytes(source: BinaryIO, target: BinaryIO, count: int) -> None:
-    while count and (block := source.read(min(count, 1 << 20))):
-        target.write(block)
-        count -= len(block)

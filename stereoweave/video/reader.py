@@ -20,6 +20,7 @@ from stereoweave.pictures.panoramas import SphereView, choose_layout, guess_proj
 from stereoweave.video.frame_sequence import FrameSequence
 from stereoweave.video.mvc import check_not_mvc
 from stereoweave.video.packings import FRAME_PACKINGS, FRAME_SEQUENTIAL, TWO_STREAMS
+from stereoweave.video.times import format_frame_time
 from stereoweave.video.tracks import Shot, Track, VideoTrack, list_picture_files, open_track
 from stereoweave.video.twin_streams import open_twins
 
@@ -141,7 +142,7 @@ class StereoVideo:
         """
         first = math.ceil(start_s * self.rate)
         if not 0 <= first < self.frame_count:
-            length = format_time(self.frame_count / self.rate)
+            length = format_frame_time(self.frame_count / self.rate)
             raise StereoweaveError(
                 f"expected a start within the video of {length}, found {start_s:g} s; choose an earlier one"
             )
@@ -364,9 +365,3 @@ def _bridge_gaps(track: _Source, start: int, first: int) -> Iterator[tuple[Shot,
         upcoming, last = index + 1, shot
     if last:
         yield from ((last, _REPEATED_LAST) for number in range(upcoming, len(track.steps)) if number >= start)
-
-
-def format_time(time_s: Fraction) -> str:
-    """Return a time in hours, minutes and seconds, for example 0:01:02.345 for 62.345 s."""
-    minutes, seconds = divmod(float(time_s), 60)
-    return f"{int(minutes) // 60}:{int(minutes) % 60:02}:{seconds:06.3f}"

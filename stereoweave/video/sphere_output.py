@@ -47,10 +47,10 @@ class WholeOutput:
 
     def marks(self, baseline_m: float | None) -> VideoMarks:
         """Return what the output file says about its views; `baseline_m` is as in `mark_layout`."""
-        packing, right_first = PACKED.get(self._layout or "", (None, False))
+        packed = PACKED.get(self._layout or "")
         return VideoMarks(
-            packing=packing,
-            right_first=right_first,
+            packing=packed and packed.packing,
+            right_first=packed is not None and packed.right_first,
             projection=self._name,
-            baseline_m=baseline_m if packing else None,
+            baseline_m=baseline_m if packed else None,
         )

@@ -27,7 +27,8 @@ from stereoweave.rendering.scaling import fit_size
 from stereoweave.stereo import StereoPair
 from stereoweave.system.threads import thread_count
 from stereoweave.video.packings import find_swapped_packing
-from stereoweave.video.reader import StereoFrame, StereoVideo, format_time
+from stereoweave.video.reader import StereoFrame, StereoVideo
+from stereoweave.video.times import format_frame_time
 
 _SURVEYED_FRAMES, _CHECKED_FRAMES = 24, 3
 # Unchecked frames are matched at this width, where a range of disparities is found as well.
@@ -177,7 +178,7 @@ def _note_flat(samples: Sequence[_Sample]) -> list[Note]:
     """Return a list with a note on the flat frames, if there are any."""
     spans = []
     for is_flat, run in groupby(samples, key=lambda sample: sample.flat):
-        times = [format_time(sample.time) for sample in run]
+        times = [format_frame_time(sample.time) for sample in run]
         if is_flat:
             spans.append(times[0] if len(times) == 1 else f"{times[0]} to {times[-1]}")
     if not spans:

@@ -11,6 +11,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from stereoweave.rendering.comfort import SCREENS
 from stereoweave.video.frame_check import FrameCheck
+from stereoweave.video.times import format_time
 from stereoweave.video.video_check import ShotCheck, VideoCheck
 
 Place = tuple[float, float]
@@ -63,7 +64,7 @@ def draw_timeline(check: VideoCheck, name: str, screen: str | None) -> UInt8[np.
     end_s = max(float(check.shots[-1].end_s), 1e-3)
     sheet = _Sheet(end_s)
     shots = "1 shot" if len(check.shots) == 1 else f"{len(check.shots)} shots"
-    title = f"{name}: {_format_time(end_s)}, {shots}, {check.shots[0].width_px} px wide"
+    title = f"{name}: {_shorten_time(end_s)}, {shots}, {check.shots[0].width_px} px wide"
     sheet.text((_LEFT_PX, 14), title, size=20)
     _draw_shots(sheet, check.shots)
     _draw_depth(sheet, check.shots, screen or _USUAL_SCREEN)
@@ -287,7 +288,7 @@ def _draw_time_axis(sheet: _Sheet, y: float) -> None:
     for number in range(math.floor(sheet.end_s / step_s) + 1):
         x = sheet.x(number * step_s)
         sheet.line([(x, y), (x, y + 6)], _GREY)
-        words = _format_time(number * step_s)
+        words = _shorten_time(number * step_s)
         sheet.text((x, y + 10), words, size=_SMALL_PX, colour=_GREY, anchor="ma")
     sheet.text(((_LEFT_PX + _RIGHT_PX) / 2, y + 36), "time, min:s; lines are cuts", colour=_GREY, anchor="ma")
 
@@ -310,7 +311,6 @@ def _find_step(length: float, most: float, rounded: Callable[[float], float] = _
     return rounded(length / most)
 
 
-def _format_time(time_s: float) -> str:
-    """Return a time as minutes and seconds, for example 1:02.3 for 62.3 s and 1:02 for 62 s."""
-    minutes, tenths = divmod(round(10 * time_s), 600)
-    return f"{minutes}:{tenths // 10:02}" + (f".{tenths % 10}" if tenths % 10 else "")
+def _shorten_time(time_s: float) -> str:
+    """Return a time without its tenths if they are 0."""
+    return format_time(time_s).removesuffix(".0")

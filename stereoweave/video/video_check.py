@@ -16,14 +16,14 @@ from stereoweave.errors import Note
 from stereoweave.matching.matcher import Matcher
 from stereoweave.rendering.comfort import SCREENS, Depth, ScreenFit, find_screen, fit_depth
 from stereoweave.system.ahead import ahead
+from stereoweave.video.cuts import begins_shot, make_small_grey
 from stereoweave.video.frame_check import FrameCheck, check_frame
-from stereoweave.video.motion import CUT_SHARE, convert_to_grey, measure_motion
-from stereoweave.video.reader import StereoFrame, StereoVideo, format_time
+from stereoweave.video.reader import StereoFrame, StereoVideo
+from stereoweave.video.times import format_frame_time
 
 # A shot's first frame may be part of a fade, so the first sample is this much later.
 _FIRST_S, _EVERY_S = Fraction(1, 5), Fraction(1)
 _MOST_SAMPLES = 240
-_MOTION_WIDTH_PX = 320
 _THUMBNAIL_PX = (160, 90)
 _NAMED_SHOTS, _NAMED_PROBLEMS = 6, 3
 _WORDS = {
@@ -203,9 +203,9 @@ def _take_samples(video: StereoVideo, spans: list[_Span], problems: list[str]) -
     waiting: StereoFrame | None = None
     for number, frame in enumerate(video.frames()):
         if frame.problem is not None:
-            problems.append(f"{format_time(frame.time)} {frame.problem}")
-        grey = _make_small_grey(frame.left)
-        if last_grey is None or measure_motion(last_grey, grey).explained_share < CUT_SHARE:
+            problems.append(f"{format_frame_time(frame.time)} {frame.problem}")
+        grey = make_small_grey(frame.left)
+        if begins_shot(last_grey, grey):
             if waiting:
                 yield _Sample(len(spans) - 1, waiting)
             spans.append(_Span(number, frame.time, _make_thumbnail(frame.left)))
@@ -219,13 +219,6 @@ def _take_samples(video: StereoVideo, spans: list[_Span], problems: list[str]) -
             waiting = frame
     if waiting:
         yield _Sample(len(spans) - 1, waiting)
-
-
-def _make_small_grey(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2"]:
-    height, width = image.shape[:2]
-    scale = max(2.0, width / _MOTION_WIDTH_PX)
-    size = max(1, round(width / scale)), max(1, round(height / scale))
-    return cv2.resize(convert_to_grey(image), size, interpolation=cv2.INTER_AREA)
 
 
 def _make_thumbnail(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:

@@ -10,7 +10,8 @@ SPATIAL = Path(__file__).resolve().parents[1] / "spatial_video" / "pan.mp4"
 SPATIAL_FRAMES, SPATIAL_GROUP = 50, 10  # a key frame every 10 frames
 
 # The boxes around the sample description of the first track, and the bytes before the boxes within each.
-_WAY = {b"moov": 0, b"trak": 0, b"mdia": 0, b"minf": 0, b"stbl": 0, b"stsd": 8, b"hvc1": 78, b"hev1": 78}
+_WAY = {b"moov": 0, b"trak": 0, b"mdia": 0, b"minf": 0, b"stbl": 0, b"stsd": 8}
+_WAY |= dict.fromkeys((b"hvc1", b"hev1", b"avc1"), 78)
 # Three-dimensional reference displays information: an SEI message in a NAL unit of type 39, of 4 or 5 bytes.
 _DISPLAYS = b"\x4e\x01\xb0"
 

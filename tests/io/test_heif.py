@@ -293,7 +293,6 @@ def test_a_colour_profile_is_applied_to_both_views(tmp_path):
         # (0.6274, 0.0691, 0.0164) of BT.2020 (ITU-R BT.2087); 0.8137, 0.2914, 0.1353 on the curve of sRGB.
         (12, 13, (234, 51, 35), "Display P3"),
         (9, 13, (207, 74, 34), "BT.2020"),
-        (9, 16, (207, 74, 34), "BT.2020 (PQ, brightness unchanged)"),
     ],
 )
 def test_colours_stated_in_numbers_are_converted(tmp_path, primaries, curve, stored, name):
@@ -302,6 +301,85 @@ def test_colours_stated_in_numbers_are_converted(tmp_path, primaries, curve, sto
     decoded = read_picture(write_heic(tmp_path / "a.heic", image, **options))
     assert np.abs(decoded.upright(None).astype(int) - (255, 0, 0)).max() <= 6
     assert decoded.note == f"colours converted from {name}"
+
+
+def write_hdr(path, codes, *, transfer=16, primaries=9):
+    """Write a picture in 10 bits, each row of which has the given shares of the greatest code, RGB."""
+    row = np.rint(np.asarray(codes) * 65535).astype(np.uint16)
+    row = np.repeat(row[:, None] if row.ndim == 1 else row, 16, axis=0)
+    image = np.ascontiguousarray(np.broadcast_to(row, (48, *row.shape)))
+    is_grey = row.shape[1] == 1
+    file = pillow_heif.from_bytes("L;16" if is_grey else "RGB;16", image.shape[1::-1], image.tobytes())
+    colours = {"color_primaries": primaries, "transfer_characteristics": transfer}
+    file.save(path, **({"quality": -1} if is_grey else LOSSLESS) | colours)
+    return path
+
+
+def srgb(light):
+    return 255 * (1.055 * light ** (1 / 2.4) - 0.055)
+
+
+def middles(decoded):
+    """Return the colours that `write_hdr` was given, as they were read."""
+    return decoded.upright(None)[24, 8::16].astype(int).tolist()
+
+
+# SMPTE ST 2084 has 50 % of the signal at 92.2457 cd/m2, 25 % at 5.1545 and 58.07 % at 203; white becomes 159
+# of 203 by the curve of BT.2390 (tests/video/test_colours.py).
+PQ_GREYS = {0.25: srgb(5.1545 / 203), 0.5: srgb(92.2457 / 203), 0.5807: srgb(0.784), 0.0: 0, 0.8: 255}
+
+
+@pytest.mark.parametrize("grey", [False, True], ids=["colour", "grey"])
+def test_the_brightness_of_pq_is_that_of_a_white_surface(tmp_path, grey):
+    codes = [share if grey else (share,) * 3 for share in PQ_GREYS]
+    decoded = read_picture(write_hdr(tmp_path / "a.heic", codes))
+    np.testing.assert_allclose(middles(decoded), [(shown,) * 3 for shown in PQ_GREYS.values()], atol=1)
+    assert decoded.note == "HDR (PQ), tone-mapped to SDR (BT.709)"
+
+
+def test_a_pair_of_hlg_and_pq_shows_the_same_white_surface(tmp_path):
+    # BT.2408: white at 203 cd/m2 is 75 % HLG.
+    left = write_hdr(tmp_path / "left.heic", [(0.75,) * 3] * 4, transfer=18)
+    right = write_hdr(tmp_path / "right.heic", [(0.5807,) * 3] * 4)
+    opened = open_pictures([left, right])
+    for eye in (opened.pair.left, opened.pair.right):
+        np.testing.assert_allclose(eye, PQ_GREYS[0.5807], atol=1)
+    notes = " ".join(map(str, opened.notes))
+    assert all(f"HDR ({name}), tone-mapped to SDR (BT.709)" in notes for name in ("HLG", "PQ"))
+
+
+@pytest.mark.parametrize(
+    ("primaries", "red"),
+    [
+        # Linear red of BT.709 in BT.2020 (BT.2087) and in Display P3 (CSS Color 4), and as it is.
+        (9, (0.6274, 0.0691, 0.0164)),
+        (12, (0.8225, 0.0332, 0.0171)),
+        (1, (1.0, 0.0, 0.0)),
+    ],
+)
+def test_the_red_of_bt709_stays_pure(tmp_path, primaries, red):
+    def encode(nits):
+        power = (nits / 10_000) ** (2610 / 16384)
+        return ((3424 / 4096 + 2413 / 128 * power) / (1 + 2392 / 128 * power)) ** (2523 / 32)
+
+    path = write_hdr(tmp_path / "a.heic", [[encode(80 * share) for share in red]] * 2, primaries=primaries)
+    np.testing.assert_allclose(middles(read_picture(path)), [(srgb(80 / 203), 0, 0)] * 2, atol=5)
+
+
+def test_hdr_of_eight_bits_is_tone_mapped_too(tmp_path):
+    image = np.full((48, 64, 3), 128, np.uint8)
+    options = {"color_primaries": 9, "transfer_characteristics": 16}
+    decoded = read_picture(write_heic(tmp_path / "a.heic", image, **options))
+    # 128 / 255 is 0.50196, 94 cd/m2.
+    np.testing.assert_allclose(decoded.upright(None), srgb(94 / 203), atol=1.5)
+
+
+def test_a_damaged_hdr_picture_is_refused_in_one_line(tmp_path):
+    path = write_hdr(tmp_path / "a.heic", [(0.5, 0.4, 0.3)] * 4)
+    content = path.read_bytes()
+    for end in (len(content) - 20, len(content) // 2):
+        path.write_bytes(content[:end])
+        assert str(path) in refusal_of(read_image, path)
 
 
 def test_a_profile_of_colours_in_numbers_has_a_copyright_of_its_own(tmp_path, pair):

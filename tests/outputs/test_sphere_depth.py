@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 from sphere_scenes import cast, look_equirectangular, render_fixed, render_turning
 
-from stereoweave.cameras.sphere_merge import MatchedWindow, merge_windows
+from stereoweave.cameras.sphere_nearness import MatchedWindow, spread_nearness
 from stereoweave.cameras.sphere_windows import make_whole_window, make_window
 from stereoweave.cameras.spherical import Projection, SphereRequest
 from stereoweave.cli.root import main
@@ -69,30 +69,34 @@ def test_distances_all_around_are_right_and_have_no_seam(tmp_path, capsys):
     assert np.median(steps[:, 0]) < 3 * np.median(steps)
 
 
-def test_overlapping_windows_of_exact_distances_merge_to_exact_distances():
-    windows = []
-    for look_deg in ((0, 0), (25, 0), (0, 25)):
-        window = make_window(HALF, (256, 256), look_deg, 60)
-        rays = np.moveaxis(window.rays().astype(float), 0, -1)
-        rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-        _, distance = cast(rays, np.array([-0.5, 0, 0]))
-        certain = np.ones(distance.shape, np.float32)
-        windows.append(MatchedWindow(window, (1 / distance).astype(np.float32), certain))
-    merged = merge_windows(windows, HALF, (256, 256))
+@pytest.mark.parametrize("look_deg", [(0, 0), (25, 0), (0, 25)])
+def test_exact_distances_of_a_window_are_exact_in_all_its_directions(look_deg):
+    window = make_window(HALF, (256, 256), look_deg, 60)
+    rays = np.moveaxis(window.rays().astype(float), 0, -1)
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    _, distance = cast(rays, np.array([-0.5, 0, 0]))
+    certain = np.ones(distance.shape, np.float32)
+    found = spread_nearness(
+        MatchedWindow(window, (1 / distance).astype(np.float32), certain), HALF, (256, 256)
+    )
     _, distance = cast(look_equirectangular((256, 256)), np.array([-0.5, 0, 0]))
-    known = ~np.isnan(merged.nearness)
-    assert known[128, 128] and known[60, 128] and known[128, 200] and not known[128, 20]
-    np.testing.assert_allclose(1 / merged.nearness[known], distance[known], rtol=0.03)
+    known = ~np.isnan(found.nearness)
+    yaw, pitch = look_deg
+    # 256 px are 180 degrees.
+    middle = 128 - round(256 * pitch / 180), 128 + round(256 * yaw / 180)
+    assert known[middle] and not known[middle[0], middle[1] - 60]
+    np.testing.assert_allclose(1 / found.nearness[known], distance[known], rtol=0.03)
 
 
-def test_windows_are_weighted_by_confidence():
-    window = make_whole_window(HALF, (128, 128))
-    flat = np.ones((window.size_px[1], window.size_px[0]), np.float32)
-    windows = [MatchedWindow(window, flat * near, flat * sure) for near, sure in ((0.1, 0.9), (0.3, 0.1))]
-    merged = merge_windows(windows, HALF, (128, 128))
-    # 0.9 * 0.1 + 0.1 * 0.3; the confidence is 0.9 * 0.9 + 0.1 * 0.1.
-    assert merged.nearness[64, 64] == pytest.approx(0.12)
-    assert merged.confidence[64, 64] == pytest.approx(0.82)
+def test_both_ends_of_a_circle_are_weighted_by_confidence():
+    window = make_whole_window(FULL, (256, 128))
+    width_px, height_px = window.size_px
+    left_end = np.broadcast_to(np.arange(width_px) < width_px / 2, (height_px, width_px))
+    nearness, confidence = (np.where(left_end, *ends).astype(np.float32) for ends in ((0.1, 0.3), (0.9, 0.1)))
+    found = spread_nearness(MatchedWindow(window, nearness, confidence), FULL, (256, 128))
+    # Behind the camera, both ends are as far from their borders: 0.9 * 0.1 + 0.1 * 0.3, and 0.9**2 + 0.1**2.
+    assert found.nearness[64, [0, -1]] == pytest.approx(0.12, abs=0.005)
+    assert found.confidence[64, [0, -1]] == pytest.approx(0.82, abs=0.02)
 
 
 def test_what_the_pictures_do_not_cover_is_unknown():
@@ -100,8 +104,8 @@ def test_what_the_pictures_do_not_cover_is_unknown():
     flat = np.ones((window.size_px[1], window.size_px[0]), np.float32)
     seen = flat > 0
     seen[: window.size_px[1] // 2] = False
-    merged = merge_windows([MatchedWindow(window, flat, flat, seen)], FULL, (256, 128))
-    assert np.isnan(merged.nearness[:60]).all() and not np.isnan(merged.nearness[68:110]).any()
+    found = spread_nearness(MatchedWindow(window, flat, flat, seen), FULL, (256, 128))
+    assert np.isnan(found.nearness[:60]).all() and not np.isnan(found.nearness[68:110]).any()
 
 
 def test_views_of_the_whole_are_vr180_again(tmp_path):
@@ -140,6 +144,17 @@ def test_a_vr180_photo_is_written_and_opened_again(tmp_path):
     for name in ("left", "right"):
         eyes = [getattr(pictures.pair, name).astype(int) for pictures in (opened, before)]
         assert np.abs(eyes[0] - eyes[1]).mean() < 2
+
+
+def test_a_window_is_no_vr180_photo(tmp_path, capsys):
+    image = np.zeros((128, 256, 3), np.uint8)
+    path, out = save(tmp_path / "a_180.png", image, image), tmp_path / "window.VR.jpg"
+    assert run("view", path, "--format", "side_by_side", "--layout", "side_by_side", "-o", out) == 2
+    assert capsys.readouterr().err == (
+        f"stereoweave: {out}: expected the whole field of view for a VR180 photo, found a window; take the "
+        "whole, or name the file otherwise (--whole)\n"
+    )
+    assert not out.exists()
 
 
 @pytest.mark.parametrize("ending", [".mpo", ".heic", ".jps"])

@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
 
@@ -14,6 +13,7 @@ import av
 import cv2
 import numpy as np
 import pytest
+from conversions import frames_of, interrupt, run, times_of, write_slow_video
 from other_processes import halted
 from rich.console import Console
 from spatial_examples import SPATIAL, spatial_pairs
@@ -40,43 +40,13 @@ from stereoweave.stereo import StereoCamera, StereoPair
 from stereoweave.video.convert import convert_video
 from stereoweave.video.frame_groups import FrameGrouper
 from stereoweave.video.job import VideoJob
-from stereoweave.video.reader import StereoFrame, StereoVideo, open_video
+from stereoweave.video.reader import StereoFrame, open_video
 
-# A part lasts 4 s, so it has 5 of these frames.
-SLOW_MS = 800
-
-
-def slow_video(path: Path, count: int = 13) -> Path:
-    return write_side_by_side(
-        path, example_pairs(count), times_ms=range(0, count * SLOW_MS, SLOW_MS), codec="libx264"
-    )
-
-
-@pytest.fixture(autouse=True)
-def default_interrupts():
-    """Restore the handler for Ctrl-C, which Python ignores if a shell starts the tests in the background."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
-def run(video: Path, out: Path, *words: str) -> int:
-    # With two threads, the second would busy-wait on a core that other tests need.
-    return main(["video", str(video), "-o", str(out), "--threads", "1", *words])
-
-
-def frames_of(video: Path) -> list[np.ndarray]:
-    with av.open(str(video)) as container:
-        return [frame.to_ndarray() for frame in container.decode(video=0)]
+pytestmark = pytest.mark.usefixtures("default_interrupts")
 
 
 def rgb_of(video: Path) -> list[np.ndarray]:
     return [frame.left for frame in open_video([video, video]).frames()]
-
-
-def times_of(video: Path) -> list[Fraction]:
-    with av.open(str(video)) as container:
-        return [frame.pts * frame.time_base for frame in container.decode(video=0)]
 
 
 def estimate_of(frame: StereoFrame):
@@ -290,17 +260,34 @@ def _red_from_green(anaglyph: np.ndarray) -> float:
     return np.abs(anaglyph[..., 0].astype(int) - anaglyph[..., 1]).mean()
 
 
-def interrupt(patch: pytest.MonkeyPatch) -> None:
-    """Let the reader raise the signal of Ctrl-C at frame 8, once a part is finished."""
-    read = StereoVideo.frames
+@pytest.mark.parametrize(
+    ("settings", "names"),
+    [
+        ({"depth": True}, ["rehearse_carrying", "rehearse_voting"]),
+        (
+            {"position": 0.5},
+            ["rehearse_carrying", "rehearse_voting", "rehearse_drawing", "rehearse_filling"],
+        ),
+        (
+            {"position": 0.5, "bits": 10},
+            ["rehearse_carrying", "rehearse_voting", "rehearse_fine_drawing"],
+        ),
+        ({"layout": "side_by_side"}, []),
+    ],
+    ids=["depth", "view", "view in 10 bits", "frames joined without matching"],
+)
+def test_the_kernels_of_a_conversion_are_compiled_ahead(tmp_path, monkeypatch, settings, names):
+    asked = []
 
-    def frames(video: StereoVideo, start: int = 0) -> Iterator[StereoFrame]:
-        for index, frame in enumerate(read(video, start), start):
-            if index == 8 and any(Path(video.name).parent.glob("*.parts/*.nut")):
-                signal.raise_signal(signal.SIGINT)
-            yield frame
+    def stop(*rehearsals):
+        asked.extend(rehearse.__name__ for rehearse in rehearsals)
+        raise StereoweaveError("enough")
 
-    patch.setattr(StereoVideo, "frames", frames)
+    monkeypatch.setattr("stereoweave.video.convert.compile_ahead", stop)
+    film = write_side_by_side(tmp_path / "in.mp4", example_pairs(1), codec="libx264")
+    with pytest.raises(StereoweaveError, match="enough"):
+        convert_video(open_video([film]), [film], tmp_path / "out.mp4", VideoJob(**settings), Console())
+    assert asked == names
 
 
 def test_cuts_are_forgotten_where_views_are_joined_without_matching(tmp_path, monkeypatch):
@@ -325,7 +312,7 @@ def test_cuts_are_forgotten_where_views_are_joined_without_matching(tmp_path, mo
     ],
 )
 def test_an_interrupted_conversion_resumes_with_the_same_frames(tmp_path, monkeypatch, capsys, words):
-    video = slow_video(tmp_path / "in.mp4")
+    video = write_slow_video(tmp_path / "in.mp4", example_pairs(13))
     assert run(video, tmp_path / "whole.mp4", *words) == 0
     with monkeypatch.context() as patch:
         interrupt(patch)
@@ -345,7 +332,7 @@ def test_an_interrupted_conversion_resumes_with_the_same_frames(tmp_path, monkey
 
 
 def test_a_resumed_conversion_reports_where_it_goes_on(tmp_path, monkeypatch, capsys):
-    video = slow_video(tmp_path / "in.mp4", 10)
+    video = write_slow_video(tmp_path / "in.mp4", example_pairs(10))
     with monkeypatch.context() as patch:
         interrupt(patch)
         assert run(video, tmp_path / "out.mp4", "--depth") == 130
@@ -372,7 +359,7 @@ def test_a_preview_is_the_middle_of_a_video(tmp_path, capsys):
 
 
 def test_an_output_in_use_is_refused_until_its_process_is_killed(tmp_path, capsys):
-    video, out = slow_video(tmp_path / "in.mp4"), tmp_path / "out.mp4"
+    video, out = write_slow_video(tmp_path / "in.mp4", example_pairs(13)), tmp_path / "out.mp4"
     program = "import sys; from stereoweave.cli.root import main; sys.exit(main())"
     words = ["video", video, "-o", out, "--depth", "--threads", "1"]
     first = subprocess.Popen([sys.executable, "-c", program, *words], stderr=subprocess.DEVNULL)
@@ -394,7 +381,7 @@ def test_an_output_in_use_is_refused_until_its_process_is_killed(tmp_path, capsy
 
 
 def test_parts_made_with_other_settings_are_not_resumed(tmp_path, monkeypatch, capsys):
-    video = slow_video(tmp_path / "in.mp4", 10)
+    video = write_slow_video(tmp_path / "in.mp4", example_pairs(10))
     with monkeypatch.context() as patch:
         interrupt(patch)
         assert run(video, tmp_path / "out.mp4", "--position", "0.4", "--convergence", "3") == 130
@@ -408,7 +395,7 @@ def test_parts_made_with_other_settings_are_not_resumed(tmp_path, monkeypatch, c
 
 
 def test_a_full_disk_is_reported_in_one_line_that_says_how_to_resume(tmp_path):
-    video = slow_video(tmp_path / "in.mp4", 135)
+    video = write_slow_video(tmp_path / "in.mp4", example_pairs(135))
     assert run(video, tmp_path / "whole.mkv", "--depth16") == 0
     # There is room for each part and for the state after it (0.9 MB), but not for the joined video.
     room_bytes = int(0.8 * (tmp_path / "whole.mkv").stat().st_size)
@@ -615,7 +602,7 @@ def test_a_series_with_a_changed_picture_is_not_resumed(tmp_path, monkeypatch, c
 
 
 def test_a_conversion_with_another_frame_packing_is_not_resumed(tmp_path, monkeypatch, capsys):
-    video = slow_video(tmp_path / "in.mp4", 10)
+    video = write_slow_video(tmp_path / "in.mp4", example_pairs(10))
     with monkeypatch.context() as patch:
         interrupt(patch)
         assert run(video, tmp_path / "out.mp4", "--position", "0.5") == 130

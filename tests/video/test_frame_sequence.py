@@ -5,6 +5,7 @@ import av
 import numpy as np
 import pytest
 from matroska_examples import block, matroska, video_track
+from opened_videos import assert_eyes, refusal_by_name
 from video_examples import damage, example_pairs, flat_pairs, truncate, write_video
 
 from stereoweave.errors import StereoweaveError
@@ -19,24 +20,6 @@ def in_turn(pairs):
     return list(chain.from_iterable(pairs))
 
 
-def refusal(path, format="frame_sequential"):
-    with pytest.raises(StereoweaveError) as caught:
-        open_video([path], format)
-    message = str(caught.value)
-    assert "\n" not in message
-    assert str(path) in message
-    return message
-
-
-def assert_eyes(video, pairs, tolerance=0.0):
-    frames = list(video.frames())
-    assert len(frames) == len(pairs)
-    for frame, (left, right) in zip(frames, pairs, strict=True):
-        assert np.abs(frame.left.astype(int) - left).mean() <= tolerance
-        assert np.abs(frame.right.astype(int) - right).mean() <= tolerance
-    return frames
-
-
 def test_left_and_right_frames_in_turn_are_pairs_at_half_the_rate(tmp_path):
     pairs = flat_pairs(4)
     path = write_video(tmp_path / "a.mkv", in_turn(pairs), codec="ffv1", sound=True)
@@ -44,7 +27,7 @@ def test_left_and_right_frames_in_turn_are_pairs_at_half_the_rate(tmp_path):
     assert (video.frame_packing, video.size_px, video.frame_count) == ("frame_sequential", (64, 48), 4)
     assert (video.rate, video.sound) == (Fraction(25, 2), path)
     assert video.notes == ()
-    frames = assert_eyes(video, pairs)
+    frames = assert_eyes(video.frames(), pairs)
     assert [frame.time for frame in frames] == [Fraction(2 * number, 25) for number in range(4)]
     assert [frame.problem for frame in frames] == [None] * 4
 
@@ -60,13 +43,13 @@ def test_a_pair_has_the_time_of_its_first_frame(tmp_path):
 def test_the_right_frame_may_come_first(tmp_path):
     pairs = flat_pairs(2)
     path = write_video(tmp_path / "a.mkv", in_turn(pair[::-1] for pair in pairs), codec="ffv1")
-    assert_eyes(open_video([path], "frame_sequential_right_first"), pairs)
+    assert_eyes(open_video([path], "frame_sequential_right_first").frames(), pairs)
 
 
 def test_h264_frames_say_that_they_are_in_turn(tmp_path):
     pairs = flat_pairs(3)
     video = open_video([write_video(tmp_path / "a.mp4", in_turn(pairs), **SEI)])
-    assert_eyes(video, pairs, tolerance=1.5)
+    assert_eyes(video.frames(), pairs, tolerance=1.5)
     assert [str(note) for note in video.notes] == [
         "frame_sequential, as the file declares; override it if it is wrong (format)"
     ]
@@ -98,7 +81,7 @@ def test_matroska_laces_both_views_in_one_block(tmp_path, mode, order):
     blocks = [block(1, 80 * number, *pair[::order]) for number, pair in enumerate(pairs)]
     path = tmp_path / "a.mkv"
     path.write_bytes(matroska([video_track(1, (160, 96), stereo_mode=mode)], blocks))
-    frames = assert_eyes(open_video([path]), pairs, tolerance=2)
+    frames = assert_eyes(open_video([path]).frames(), pairs, tolerance=2)
     assert [frame.time for frame in frames] == [Fraction(2 * number, 25) for number in range(4)]
 
 
@@ -108,7 +91,7 @@ def test_pictures_in_turn_are_pairs(tmp_path):
         write_image(tmp_path / f"{number:02}.png", image)
     video = open_video([tmp_path], "frame_sequential", rate=Fraction(50))
     assert video.rate == 25
-    assert_eyes(video, pairs)
+    assert_eyes(video.frames(), pairs)
 
 
 def test_reading_from_the_middle_and_excerpts_yield_the_same_pairs(tmp_path):
@@ -158,7 +141,9 @@ def test_pictures_are_read_from_the_middle_as_from_the_start(tmp_path, missing):
 def test_an_odd_frame_has_no_partner(tmp_path, count):
     path = write_video(tmp_path / "a.mkv", in_turn(flat_pairs(2))[:count], codec="ffv1")
     if count == 1:
-        assert "expected left and right frames in turn, found a video of one frame" in refusal(path)
+        assert "expected left and right frames in turn, found a video of one frame" in refusal_by_name(
+            path, "frame_sequential"
+        )
     else:
         video = open_video([path], "frame_sequential")
         assert video.frame_count == 1
@@ -205,14 +190,14 @@ def test_a_frame_sequence_declared_of_a_single_view_is_one_frame(tmp_path):
     path.write_bytes(
         matroska([video_track(1, (160, 96), stereo_mode=13)], [block(1, 0, example_pairs(1)[0][0])])
     )
-    assert "found a video of one frame" in refusal(path, None)
+    assert "found a video of one frame" in refusal_by_name(path)
 
 
 def test_a_film_without_any_whole_pair_is_refused(tmp_path):
     path = write_video(tmp_path / "a.avi", in_turn(example_pairs(3)), codec="mjpeg")
     for frame in (1, 3, 5):
         damage(path, frame, length=400)
-    told = refusal(path)
+    told = refusal_by_name(path, "frame_sequential")
     assert "found no left frame that can be decoded together with its right frame" in told
     assert "copy the video again" in told
 
@@ -222,7 +207,9 @@ def test_pictures_without_any_whole_pair_are_refused(tmp_path):
         write_image(tmp_path / f"{number:02}.png", image)
         if number % 2 == 0:
             (tmp_path / f"{number:02}.png").write_bytes(b"damaged")
-    assert "found no left frame that can be decoded together with its right frame" in refusal(tmp_path)
+    assert "found no left frame that can be decoded together with its right frame" in refusal_by_name(
+        tmp_path, "frame_sequential"
+    )
 
 
 def test_an_excerpt_without_any_whole_pair_shows_the_pair_before_it(tmp_path):

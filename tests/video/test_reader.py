@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import av
 import numpy as np
 import pytest
+from opened_videos import assert_eyes, refusal
 from video_examples import (
     FRAME_MS,
     damage,
@@ -31,29 +32,11 @@ BEFORE = "damaged: replaced by the frame before it"
 SPOILT = "decoded from a damaged frame before it"
 
 
-def assert_eyes(frames, pairs, tolerance=0.0):
-    """Assert that each eye differs from the expected image by at most `tolerance` levels on average."""
-    frames = list(frames)
-    assert len(frames) == len(pairs)
-    for frame, expected in zip(frames, pairs, strict=True):
-        for eye, image in zip(frame[:2], expected, strict=True):
-            assert eye.shape == image.shape
-            assert np.abs(eye.astype(int) - image).mean() <= tolerance
-
-
 def assert_same(frames, others):
     for frame, other in zip(frames, others, strict=True):
         np.testing.assert_array_equal(frame.left, other.left)
         np.testing.assert_array_equal(frame.right, other.right)
         assert frame[2:] == other[2:]
-
-
-def refusal(*paths, **options):
-    with pytest.raises(StereoweaveError) as caught:
-        open_video(paths, **options)
-    message = str(caught.value)
-    assert "\n" not in message
-    return message
 
 
 def problems(video):

@@ -6,8 +6,9 @@ import av
 import cv2
 import numpy as np
 import pytest
+from conversions import frames_of, times_of
 from rich.console import Console
-from spatial_examples import box, psnr_db
+from spatial_examples import box, psnr_db, with_boxes
 from sphere_scenes import look_equirectangular, look_fisheye, render_fixed, render_turning
 from video_examples import write_side_by_side
 
@@ -48,31 +49,8 @@ def run(*words):
     return main([*map(str, words)])
 
 
-def with_boxes(content, boxes, way=(b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd", b"avc1")):
-    """Return the boxes of an MP4 file, whose index is at its end, with more in its sample description."""
-    changed, start = b"", 0
-    while start + 8 <= len(content):
-        size, kind = struct.unpack_from(">L4s", content, start)
-        inner = content[start + 8 : start + size]
-        if way and kind == way[0]:
-            before = {b"stsd": 8, b"avc1": 78}.get(kind, 0)
-            inner = inner[:before] + with_boxes(inner[before:], boxes, way[1:])
-        changed, start = changed + box(kind, inner), start + size
-    return changed if way else boxes + changed
-
-
 def first_frame(video):
     return next(iter(video.frames()))
-
-
-def read_frames(path):
-    with av.open(str(path)) as container:
-        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
-
-
-def times_of(path):
-    with av.open(str(path)) as container:
-        return [frame.pts * frame.time_base for frame in container.decode(video=0)]
 
 
 def test_a_marked_vr180_film_opens_as_a_window_with_its_baseline(tmp_path, half_scene):
@@ -165,7 +143,7 @@ def test_the_whole_of_a_film_becomes_vr180_again(tmp_path, half_scene, layout, p
     again = open_video([out])
     assert again.frame_packing == layout and again.declared_sphere.baseline_m == 0.063
     assert again.sphere.projection == Projection.named("half_equirectangular")
-    one, other = (read_frames(path)[2] for path in (film, out))
+    one, other = (frames_of(path, "rgb24")[2] for path in (film, out))
     if layout == "top_bottom":
         one = np.vstack(np.split(one, 2, axis=1))
     middle = np.s_[40:216, 40:216]
@@ -201,7 +179,7 @@ def test_a_view_and_the_depth_of_a_whole_film_have_one_eye(tmp_path, half_scene)
     for index, words in enumerate((["--position", 0.5], ["--depth"])):
         out = tmp_path / f"{index}.mp4"
         assert run("video", film, "--whole", *words, "-o", out) == 0
-        frames = read_frames(out)
+        frames = frames_of(out, "rgb24")
         assert len(frames) == 5 and frames[0].shape == (256, 256, 3)
 
 

@@ -4,56 +4,15 @@ import av
 import numpy as np
 import pytest
 from matroska_examples import block, matroska, stereo_track, video_track
-from video_examples import FRAME_MS, damage, example_pairs, flat_pairs, truncate, write_video
+from opened_videos import assert_eyes, refusal_by_name
+from video_examples import FRAME_MS, damage, example_pairs, flat_pairs, truncate, write_streams, write_video
 
-from stereoweave.errors import FormatError, StereoweaveError
+from stereoweave.errors import FormatError
 from stereoweave.video.reader import open_video
-
-
-def write_streams(path, *streams, codec="mjpeg", rates=None, sound=False):
-    """Write a video with a stream for each list of frames, as Fujifilm's cameras do: one after the other."""
-    with av.open(str(path), "w") as container:
-        for index, frames in enumerate(streams):
-            stream = container.add_stream(codec, rate=rates[index] if rates else 25)
-            stream.height, stream.width = frames[0].shape[:2]
-            stream.pix_fmt = {"mjpeg": "yuvj422p", "ffv1": "bgr0"}.get(codec, "yuv420p")
-            stream.codec_context.qmax = 2
-        track = container.add_stream("pcm_s16le", rate=8000) if sound else None
-        for number in range(max(map(len, streams))):
-            for index, (stream, frames) in enumerate(zip(container.streams.video, streams, strict=True)):
-                if number < len(frames):
-                    frame = av.VideoFrame.from_ndarray(frames[number], "rgb24")
-                    frame.pts, frame.time_base = number, Fraction(1, rates[index] if rates else 25)
-                    container.mux(stream.encode(frame))
-        for stream in container.streams.video:
-            container.mux(stream.encode())
-        if track:
-            wave = av.AudioFrame.from_ndarray(np.zeros((1, 8000), np.int16), format="s16", layout="mono")
-            wave.pts, wave.rate, wave.time_base = 0, 8000, Fraction(1, 8000)
-            container.mux([*track.encode(wave), *track.encode()])
-    return path
 
 
 def split(pairs):
     return [left for left, _ in pairs], [right for _, right in pairs]
-
-
-def refusal(path, format=None):
-    with pytest.raises(StereoweaveError) as caught:
-        open_video([path], format)
-    message = str(caught.value)
-    assert "\n" not in message
-    assert str(path) in message
-    return message
-
-
-def assert_eyes(video, pairs, tolerance=7):
-    frames = list(video.frames())
-    assert len(frames) == len(pairs)
-    for frame, (left, right) in zip(frames, pairs, strict=True):
-        assert np.abs(frame.left.astype(int) - left).mean() < tolerance
-        assert np.abs(frame.right.astype(int) - right).mean() < tolerance
-    return frames
 
 
 @pytest.mark.parametrize("name", ["DSCF0001.AVI", "a.mkv", "a.mov"])
@@ -67,7 +26,7 @@ def test_two_like_streams_are_a_pair_with_the_left_one_first(tmp_path, name):
     assert [str(note) for note in video.notes] == [
         "two video streams of the same size and rate, the left one first; override it if it is wrong (format)"
     ]
-    frames = assert_eyes(video, pairs)
+    frames = assert_eyes(video.frames(), pairs, tolerance=7)
     assert [frame.time for frame in frames] == [Fraction(number, 25) for number in range(5)]
 
 
@@ -75,7 +34,7 @@ def test_the_right_stream_may_come_first(tmp_path):
     pairs = example_pairs(3)
     path = write_streams(tmp_path / "a.avi", *split(pairs)[::-1])
     video = open_video([path], "two_streams_right_first")
-    assert_eyes(video, pairs)
+    assert_eyes(video.frames(), pairs, tolerance=7)
     assert [str(note) for note in video.notes] == [
         "two video streams of the same size and rate, right one first, as given"
     ]
@@ -93,15 +52,17 @@ def test_matroska_names_the_views_whatever_their_order(tmp_path):
     path.write_bytes(matroska(tracks, blocks))
     video = open_video([path])
     assert "in the order of their names" in str(video.notes[0])
-    assert_eyes(video, pairs)
-    assert_eyes(open_video([path], "two_streams_right_first"), [pair[::-1] for pair in pairs])
+    assert_eyes(video.frames(), pairs, tolerance=7)
+    assert_eyes(
+        open_video([path], "two_streams_right_first").frames(), [pair[::-1] for pair in pairs], tolerance=7
+    )
 
 
 def test_two_streams_of_different_scenes_are_no_pair(tmp_path):
     """As of a file with two channels, or two angles of a stage: the first stream is read alone."""
     left, right = split(example_pairs(3))
     path = write_streams(tmp_path / "a.mkv", left, [np.flip(image, (0, 1)).copy() for image in right])
-    assert "halves that do not resemble each other" in refusal(path)
+    assert "halves that do not resemble each other" in refusal_by_name(path)
     assert open_video([path], "two_streams").frame_packing == "two_streams"
     assert open_video([path], "side_by_side").frame_packing == "side_by_side"
 
@@ -109,7 +70,7 @@ def test_two_streams_of_different_scenes_are_no_pair(tmp_path):
 def test_streams_too_plain_to_tell_are_a_pair(tmp_path):
     pairs = flat_pairs(2)
     path = write_streams(tmp_path / "a.avi", *split(pairs))
-    assert_eyes(open_video([path]), pairs)
+    assert_eyes(open_video([path]).frames(), pairs, tolerance=7)
 
 
 def test_a_packed_stream_beside_its_cover_is_read_as_before(tmp_path):
@@ -166,21 +127,23 @@ def test_a_file_that_is_cut_off_is_read_up_to_there(tmp_path):
 def test_streams_of_two_sizes_are_refused_if_named(tmp_path, right, found):
     left, other = split(example_pairs(2))
     path = write_streams(tmp_path / "a.avi", left, right([image.copy() for image in other]))
-    assert found in refusal(path, "two_streams")
+    assert found in refusal_by_name(path, "two_streams")
 
 
 def test_streams_of_two_rates_are_refused_if_named(tmp_path):
     path = write_streams(tmp_path / "a.mkv", *split(example_pairs(4)), rates=[25, 50])
-    assert "expected two video streams of the same size and rate, found 2" in refusal(path, "two_streams")
+    assert "expected two video streams of the same size and rate, found 2" in refusal_by_name(
+        path, "two_streams"
+    )
 
 
 def test_one_stream_and_three_are_refused_if_named(tmp_path):
     left, right = split(example_pairs(2))
     one = write_video(tmp_path / "one.mkv", left)
-    assert "found 1: 160x96; choose another frame packing (format)" in refusal(one, "two_streams")
+    assert "found 1: 160x96; choose another frame packing (format)" in refusal_by_name(one, "two_streams")
     three = write_streams(tmp_path / "three.mkv", left, right, left)
-    assert "found 3: 160x96, 160x96, 160x96" in refusal(three, "two_streams")
-    assert "halves that do not resemble each other" in refusal(three)
+    assert "found 3: 160x96, 160x96, 160x96" in refusal_by_name(three, "two_streams")
+    assert "halves that do not resemble each other" in refusal_by_name(three)
 
 
 def test_a_stream_without_a_frame_is_named(tmp_path):
@@ -188,7 +151,9 @@ def test_a_stream_without_a_frame_is_named(tmp_path):
     tracks = [video_track(1, (160, 96)), video_track(2, (160, 96)), stereo_track(3, [(1, 0), (2, 1)])]
     path = tmp_path / "a.mkv"
     path.write_bytes(matroska(tracks, [block(1, 0, pairs[0][0]), block(1, FRAME_MS, pairs[1][0])]))
-    assert "a.mkv, stream 1: expected a video, found a file without a decodable frame" in refusal(path)
+    assert "a.mkv, stream 1: expected a video, found a file without a decodable frame" in refusal_by_name(
+        path
+    )
 
 
 @pytest.mark.parametrize("planes", [[(1, 0), (2, 0)], [(1, 1), (2, 1)], [(1, 0)], [(7, 0), (8, 1)], []])
@@ -200,7 +165,7 @@ def test_planes_that_contradict_each_other_are_ignored(tmp_path, planes):
     path.write_bytes(matroska(tracks, blocks))
     video = open_video([path])
     assert "the left one first" in str(video.notes[0])
-    assert_eyes(video, pairs)
+    assert_eyes(video.frames(), pairs, tolerance=7)
 
 
 @pytest.mark.parametrize("size_px", [(0, 0), (65_000, 65_000), (2**31, 2**31)])
@@ -217,5 +182,5 @@ def test_a_false_size_is_no_traceback(tmp_path, size_px):
 
 def test_an_empty_file_is_refused(tmp_path):
     (tmp_path / "a.avi").write_bytes(b"")
-    assert "found an empty file" in refusal(tmp_path / "a.avi")
-    assert "found an empty file" in refusal(tmp_path / "a.avi", "two_streams")
+    assert "found an empty file" in refusal_by_name(tmp_path / "a.avi")
+    assert "found an empty file" in refusal_by_name(tmp_path / "a.avi", "two_streams")

@@ -1,63 +1,29 @@
 """`stereoweave video --screen`: whole conversions, resuming, layouts, odd films, and mistakes."""
 
 import re
-import signal
-from collections.abc import Iterator
 from pathlib import Path
 
-import av
 import numpy as np
 import pytest
+from conversions import frames_of, interrupt, run, write_slow_video
 from faulty_video_examples import box_at_the_left_border, shot_of
 from video_examples import TEXTURED, example_pairs, flat_pairs, truncate, write_side_by_side
 
-from stereoweave.cli.root import main
 from stereoweave.errors import StereoweaveError
 from stereoweave.matching.estimate import match
 from stereoweave.matching.matcher import Matcher
 from stereoweave.rendering.comfort import measure_depth
 from stereoweave.stereo import StereoPair
-from stereoweave.video.reader import StereoFrame, StereoVideo, open_video
+from stereoweave.video.reader import open_video
 from stereoweave.video.writer import Recorder
 
-# A part lasts 4 s, so it has 5 of these frames.
-SLOW_MS = 800
+pytestmark = pytest.mark.usefixtures("default_interrupts")
 
 
-@pytest.fixture(autouse=True)
-def default_interrupts():
-    """Restore the handler for Ctrl-C, which Python ignores if a shell starts the tests in the background."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
-def run(video: Path, out: Path, *words: str) -> int:
-    return main(["video", str(video), "-o", str(out), "--threads", "1", *words])
-
-
-def slow_video(path: Path) -> Path:
+def cut_video(path: Path) -> Path:
     """Write a video with a cut in its second part."""
     pairs = example_pairs(7) + [(left[::-1], right[::-1]) for left, right in example_pairs(10)[7:]]
-    return write_side_by_side(path, pairs, times_ms=range(0, 10 * SLOW_MS, SLOW_MS), codec="libx264")
-
-
-def frames_of(video: Path) -> list[np.ndarray]:
-    with av.open(str(video)) as container:
-        return [frame.to_ndarray() for frame in container.decode(video=0)]
-
-
-def interrupt(patch: pytest.MonkeyPatch) -> None:
-    """Let the reader raise the signal of Ctrl-C at frame 8, once a part is finished."""
-    read = StereoVideo.frames
-
-    def frames(video: StereoVideo, start: int = 0) -> Iterator[StereoFrame]:
-        for index, frame in enumerate(read(video, start), start):
-            if index == 8 and any(Path(video.name).parent.glob("*.parts/*.nut")):
-                signal.raise_signal(signal.SIGINT)
-            yield frame
-
-    patch.setattr(StereoVideo, "frames", frames)
+    return write_slow_video(path, pairs)
 
 
 def eyes_of(video: Path) -> list:
@@ -71,7 +37,7 @@ def test_the_depth_of_the_output_is_within_the_budget(tmp_path, capsys):
     assert line.startswith("television: strength ")
     assert line.endswith("px, depth -1.0 % to +2.0 % of the width")
     for frame in eyes_of(tmp_path / "out_LRF_Full_SBS.mp4"):
-        # 1 % and 2 % of 320 px, measured anew in the compressed pictures.
+        # 1 % and 2 % of 320 px, as found in the pictures after compression.
         pair = StereoPair(left=frame.left, right=frame.right)
         found = measure_depth(match(Matcher("small", threads=1), pair))
         assert found.near_px == pytest.approx(3.2, abs=0.8)
@@ -95,7 +61,7 @@ def test_an_interrupted_conversion_for_a_screen_resumes_with_the_same_frames(
     tmp_path, monkeypatch, capsys, layout
 ):
     words = ("--layout", layout, "--screen", "phone")
-    video = slow_video(tmp_path / "in.mp4")
+    video = cut_video(tmp_path / "in.mp4")
     assert run(video, tmp_path / "whole.mp4", *words) == 0
     with monkeypatch.context() as patch:
         interrupt(patch)
@@ -124,7 +90,7 @@ def test_a_conversion_that_stopped_before_the_parts_were_joined_still_reports_th
 
 
 def test_parts_for_another_screen_are_not_resumed(tmp_path, monkeypatch, capsys):
-    video = slow_video(tmp_path / "in.mp4")
+    video = cut_video(tmp_path / "in.mp4")
     with monkeypatch.context() as patch:
         interrupt(patch)
         assert run(video, tmp_path / "out.mp4", "--layout", "side_by_side", "--screen", "phone") == 130

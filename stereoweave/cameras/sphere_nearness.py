@@ -1,6 +1,5 @@
-"""Merging of windows' distances into one equirectangular map."""
+"""Distances found in a window, as an equirectangular map."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import cv2
@@ -33,23 +32,24 @@ class MatchedWindow(NamedTuple):
     seen: Bool[np.ndarray, "h w"] | None = None
 
 
-class Merged(NamedTuple):
+class SphereNearness(NamedTuple):
     """Equirectangular maps [H, W]: 1 / distance in 1 / baselines, NaN where unknown, and confidence."""
 
     nearness: Float32[np.ndarray, "h w"]
     confidence: Float32[np.ndarray, "h w"]
 
 
-def merge_windows(
-    windows: Sequence[MatchedWindow], projection: Projection, size_px: tuple[int, int]
-) -> Merged:
-    """Return the mean of overlapping windows, weighted by confidence and by the distance to their borders.
+def spread_nearness(
+    matched: MatchedWindow, projection: Projection, size_px: tuple[int, int]
+) -> SphereNearness:
+    """Return what was found in a window, in the directions of an equirectangular image.
 
-    Nearness, and not distance, is averaged: its errors are as large far away as they are near. It is unknown
-    where no window reaches, and where less than a quarter of the baseline is left.
+    It is unknown outside the window, and where less than a quarter of the baseline is left. Where both ends
+    of a circle show the same directions, they are weighted by confidence and by the distance to the border.
+    Nearness, and not distance, is averaged: its errors are as large far away as they are near.
 
     Args:
-        windows: The windows, each with what was found in it.
+        matched: The window with what was found in it.
         projection: Equirectangular projection of the result.
         size_px: Width and height of the result.
     """
@@ -59,17 +59,16 @@ def merge_windows(
         rows = slice(start, start + _BAND_ROWS)
         rays = projection.rays(size_px, rows)
         total, near, sure = (np.zeros(rays.shape[1:], np.float32) for _ in range(3))
-        for matched in windows:
-            columns, lines = matched.window.find(rays)
-            for shift in matched.window.repeats_px:
-                weight, found, trust = _sample(matched, columns + shift, lines)
-                total += weight
-                near += weight * found
-                sure += weight * trust
-        known = (total > 0) & (windows[0].window.blindness_deg(rays) <= BLIND_DEG)
+        columns, lines = matched.window.find(rays)
+        for shift in matched.window.repeats_px:
+            weight, found, trust = _sample(matched, columns + shift, lines)
+            total += weight
+            near += weight * found
+            sure += weight * trust
+        known = (total > 0) & (matched.window.blindness_deg(rays) <= BLIND_DEG)
         nearness[rows][known] = near[known] / total[known]
         confidence[rows][known] = sure[known] / total[known]
-    return Merged(nearness, confidence)
+    return SphereNearness(nearness, confidence)
 
 
 def _sample(matched: MatchedWindow, columns: Map, lines: Map) -> tuple[Map, Map, Map]:
