@@ -145,7 +145,8 @@ def without_shape_checks(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="session")
 def ray_address(s3: str) -> Iterator[str]:
     """Yield the address, for `--address`, of a Ray cluster with 2 CPUs that can reach the S3 server."""
-    with ray_head(cpus=2) as address:
+    # As if each start of a proxy of Ray Serve were slow; the service must wait for it nevertheless.
+    with ray_head(cpus=2, RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S="0.1") as address:
         yield address
 
 
