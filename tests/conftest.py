@@ -22,7 +22,7 @@ from uuid import uuid4
 import jaxtyping
 import numpy as np
 import pytest
-from other_processes import find_free_ports, list_processes
+from other_processes import UNMEASURED, find_free_ports, list_processes
 from xdist.workermanage import WorkerController
 
 TESTDATA = Path(
@@ -181,6 +181,7 @@ def ray_head(cpus: int, **variables: str) -> Iterator[str]:
         paths = [str(root), str(root / "tests" / "helpers"), *filter(None, [os.environ.get("PYTHONPATH")])]
         with log.open("wb") as out:
             environment = {name: value for name, value in os.environ.items() if name != LOOPBACK_ALONE} | {
+                **UNMEASURED,
                 # A token in the user's home folder would otherwise be required.
                 "RAY_AUTH_MODE": "disabled",
                 # With usage reports turned off, the head node would still report that they are off.

@@ -22,6 +22,7 @@ import pytest
 import watching
 from hostile_calibrations import HOSTILE
 from hostile_requests import make_hostile_requests
+from other_processes import MEASURED_ALONE
 from prometheus_client import Metric
 from prometheus_client.parser import text_string_to_metric_families
 from ray.exceptions import RayActorError
@@ -67,7 +68,7 @@ def run_serve_command(uploads: Path, *words: object) -> Iterator[Running]:
     # Ray reports metrics every ten seconds by default. The paths of its sockets must be short.
     ray = {"RAY_metrics_report_interval_ms": "1000", "RAY_TMPDIR": "/tmp"}
     process = subprocess.Popen(
-        [sys.executable, "-m", "stereoweave", "serve", "--port", "0", *map(str, words)],
+        [sys.executable, *MEASURED_ALONE, "serve", "--port", "0", *map(str, words)],
         stdout=subprocess.PIPE,
         text=True,
         env={**os.environ, **ray, "TMPDIR": str(uploads)},
