@@ -22,7 +22,7 @@ from uuid import uuid4
 import jaxtyping
 import numpy as np
 import pytest
-from other_processes import find_free_ports, list_processes
+from other_processes import UNMEASURED, find_free_ports, list_processes
 from xdist.workermanage import WorkerController
 
 TESTDATA = Path(
@@ -145,7 +145,8 @@ def without_shape_checks(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="session")
 def ray_address(s3: str) -> Iterator[str]:
     """Yield the address, for `--address`, of a Ray cluster with 2 CPUs that can reach the S3 server."""
-    with ray_head(cpus=2) as address:
+    # As if each start of a proxy of Ray Serve were slow; the service must wait for it nevertheless.
+    with ray_head(cpus=2, RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S="0.1") as address:
         yield address
 
 
@@ -180,6 +181,7 @@ def ray_head(cpus: int, **variables: str) -> Iterator[str]:
         paths = [str(root), str(root / "tests" / "helpers"), *filter(None, [os.environ.get("PYTHONPATH")])]
         with log.open("wb") as out:
             environment = {name: value for name, value in os.environ.items() if name != LOOPBACK_ALONE} | {
+                **UNMEASURED,
                 # A token in the user's home folder would otherwise be required.
                 "RAY_AUTH_MODE": "disabled",
                 # With usage reports turned off, the head node would still report that they are off.

@@ -16,7 +16,7 @@ import grpc
 import httpx
 import psutil
 import pytest
-from other_processes import halted
+from other_processes import UNMEASURED, halted
 from visitor import Visitor
 
 from stereoweave.io.images import read_image, write_image
@@ -83,7 +83,7 @@ class Watched:
             stdout=subprocess.PIPE,
             text=True,
             # The paths of Ray's sockets must be short.
-            env={**kept, "RAY_TMPDIR": "/tmp", "PYTHONUNBUFFERED": "1"},
+            env={**kept, **UNMEASURED, "RAY_TMPDIR": "/tmp", "PYTHONUNBUFFERED": "1"},
         )
 
     def wait_for(self, pattern: str) -> str:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from other_processes import UNMEASURED
 from PIL import Image, ImageSequence
 from pyarrow import parquet
 from spatial_examples import SPATIAL
@@ -54,9 +55,8 @@ SHORTER = {
 
 def run(command: list[str | Path], folder: Path, **environment: str) -> str:
     """Run a command and return its output, which is shown in full if the command fails."""
-    done = subprocess.run(
-        command, cwd=folder, env=os.environ | environment, capture_output=True, text=True, check=False
-    )
+    environment = os.environ | UNMEASURED | environment
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 

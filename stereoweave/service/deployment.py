@@ -47,6 +47,8 @@ _MEGAPIXELS_AT_ONCE = 32
 _MOST_QUEUED = 200
 # A replica starts in seconds; the first replica on a machine also compiles the kernels.
 _TRIAL_LIMIT_S = 120
+# As long as Ray Serve waits for its proxies. By default it kills one after 5 s, which a busy machine needs.
+_PROXY_START_LIMIT_S = 60
 _LOGGING = LoggingConfig(log_level="ERROR", enable_access_log=False)
 
 
@@ -235,13 +237,32 @@ def _serve_at_proxies(settings: Settings, listener: socket.socket) -> Iterator[N
     """Serve from Ray Serve's HTTP proxies, one on each machine."""
     host, port = listener.getsockname()[:2]
     listener.close()
-    serve.start(http_options={"host": host, "port": port}, logging_config=_LOGGING)
     try:
+        _start_proxies(host, port)
         _start_replicas(settings)
         yield
     finally:
         _stop_replicas()
+        # Also after a failed start: Ray Serve would stay, and the next service could not change its port.
         serve.shutdown()  # type: ignore[no-untyped-call]
+
+
+def _start_proxies(host: str, port: int) -> None:
+    """Start Ray Serve's HTTP proxies and wait until they are ready."""
+    # Ray's name for it; read by the controller alone, which is a process on any machine of the cluster.
+    limit = {"RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S": str(_PROXY_START_LIMIT_S)}
+    try:
+        serve.start(
+            http_options={"host": host, "port": port},
+            logging_config=_LOGGING,
+            controller_options={"runtime_env": {"env_vars": limit}},
+        )
+    except (RayActorError, TimeoutError) as error:
+        found = str(error).splitlines()[0].rstrip(".")
+        raise StereoweaveError(
+            f"Ray Serve: expected HTTP proxies that are ready within {_PROXY_START_LIMIT_S} s, found: {found}"
+            "; is a machine of the cluster overloaded?"
+        ) from error
 
 
 def _check_free(address: str | None) -> None:

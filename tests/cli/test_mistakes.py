@@ -4,10 +4,11 @@
 """
 
 import shlex
+import shutil
 from pathlib import Path
 
 import pytest
-from error_examples import TEXTURED, write_error_examples
+from error_examples import write_error_examples
 from PIL import Image
 
 from stereoweave.cli.root import main
@@ -138,8 +139,8 @@ MISTAKES = {
 def folder(tmp_path, monkeypatch) -> Path:
     write_error_examples(tmp_path)
     monkeypatch.chdir(tmp_path)
-    with Image.open(TEXTURED / "left.png") as picture:
-        picture.save("my photo.png")
+    shutil.copy("left.png", "my photo.png")
+    with Image.open("left.png") as picture:
         picture.crop((0, 0, 300, 200)).save("small.png")
     Path("film.mp4").write_bytes(b"\0\0\0\x18ftypisom\0\0\0\0isom" + bytes(200))
     Path("photo.heic").write_bytes(b"\0\0\0\x18ftypheic\0\0\0\0mif1heic" + bytes(200))

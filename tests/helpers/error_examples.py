@@ -1,6 +1,8 @@
 """Files that cause errors and notes whose remedies name settings."""
 
+import functools
 import shutil
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +25,19 @@ def write_error_examples(folder: Path) -> None:
     """Write a pair, the same pair with the right picture 2 px lower, converging cameras or a zoomed
     right picture, plain pictures, and two calibrations.
     """
+    for name, content in _make_error_examples().items():
+        (folder / name).write_bytes(content)
+
+
+@functools.cache
+def _make_error_examples() -> dict[str, bytes]:
+    """Return the files' contents by name. Made once, because each of many tests writes them."""
+    with tempfile.TemporaryDirectory() as folder:
+        _write_new_examples(Path(folder))
+        return {file.name: file.read_bytes() for file in Path(folder).iterdir()}
+
+
+def _write_new_examples(folder: Path) -> None:
     for name in ("left.png", "right.png"):
         shutil.copy(TEXTURED / name, folder)
     left, right = (read_image(TEXTURED / name) for name in ("left.png", "right.png"))

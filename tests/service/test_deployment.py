@@ -12,6 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import httpx
@@ -21,8 +22,10 @@ import pytest
 import watching
 from hostile_calibrations import HOSTILE
 from hostile_requests import make_hostile_requests
+from other_processes import MEASURED_ALONE
 from prometheus_client import Metric
 from prometheus_client.parser import text_string_to_metric_families
+from ray.exceptions import RayActorError
 from service_examples import BOTH, CALIB, TEXTURED, Sender, make_malformed_requests
 
 import stereoweave as sw
@@ -65,7 +68,7 @@ def run_serve_command(uploads: Path, *words: object) -> Iterator[Running]:
     # Ray reports metrics every ten seconds by default. The paths of its sockets must be short.
     ray = {"RAY_metrics_report_interval_ms": "1000", "RAY_TMPDIR": "/tmp"}
     process = subprocess.Popen(
-        [sys.executable, "-m", "stereoweave", "serve", "--port", "0", *map(str, words)],
+        [sys.executable, *MEASURED_ALONE, "serve", "--port", "0", *map(str, words)],
         stdout=subprocess.PIPE,
         text=True,
         env={**os.environ, **ray, "TMPDIR": str(uploads)},
@@ -411,6 +414,30 @@ def test_on_a_cluster_rays_proxies_answer_the_same_requests(ray_address, tmp_pat
         assert post(running.client, "/disparity").status_code == 200
         assert running.client.get("/health", headers={"Host": "evil.example"}).status_code == 400
         assert running.client.get("/health").status_code == 200
+
+
+def test_proxies_that_do_not_start_are_reported_in_one_line_and_end_ray_serve(monkeypatch):
+    from stereoweave.service import deployment  # its import warns
+
+    ended = []
+    monkeypatch.setattr(deployment.serve, "start", raise_actor_died)
+    monkeypatch.setattr(deployment.serve, "status", lambda: SimpleNamespace(applications={}))
+    monkeypatch.setattr(deployment.serve, "shutdown", lambda: ended.append(True))
+    listener = socket.create_server(("127.0.0.1", 0))
+    with (
+        pytest.raises(StereoweaveError) as caught,
+        deployment._serve_at_proxies(deployment.Settings(), listener),
+    ):
+        pass
+    assert str(caught.value) == (
+        "Ray Serve: expected HTTP proxies that are ready within 60 s, found: The actor died; "
+        "is a machine of the cluster overloaded?"
+    )
+    assert ended == [True]
+
+
+def raise_actor_died(**_: object) -> None:
+    raise RayActorError(error_msg="The actor died.\nIt never ran.")
 
 
 def test_accepted_requests_are_answered_before_the_service_ends(running):
