@@ -67,6 +67,14 @@ def make(  # noqa: PLR0913 - each is an option of the command
             "pair; with --worlds, 0.825 times the width, and 0.5 m).",
         ),
     ] = None,
+    distance: Annotated[
+        tuple[float, float] | None,
+        typer.Option(
+            metavar="NEAR_M FAR_M",
+            help="With --worlds, least and greatest distance of the cameras from the target's centre in "
+            "metres (default: the nearer half of the scene's).",
+        ),
+    ] = None,
     jobs: Annotated[
         int | None,
         typer.Option(
@@ -90,6 +98,7 @@ def make(  # noqa: PLR0913 - each is an option of the command
         views=tuple(view or ()),
         rig=rig,
         by_world=worlds is not None,
+        distance_m=distance,
     )
     pair_maker, engine = PairRenderer(plain), make_engine(cluster, workers=jobs)
     made = make_set(spec, count, out, layout=layout, jobs=_jobs(jobs), engine=engine, pair_maker=pair_maker)

@@ -227,7 +227,7 @@ def _set_facts(spec: RenderSpec, layout: str, pair_maker: PairMaker) -> dict[str
     facts = {"format": FORMAT, "layout": layout, **asdict(spec)}
     # Sets without worlds keep the description that they had before there were sets by world.
     if not facts["by_world"]:
-        del facts["by_world"]
+        del facts["by_world"], facts["distance_m"]
     return facts | {"generator": generator_version(), "renderer": pair_maker.renderer()}
 
 

@@ -64,6 +64,8 @@ class RenderSpec:
             `world_rig` if the set is by world.
         by_world: Whether the camera of a video keeps moving around the target (`camera_paths`), instead of
             crossing a part of the orbit once, from a start to an end. Pairs are then named after their world.
+        distance_m: Least and greatest distance of the cameras from the target's centre, in a set by world; if
+            None, the nearer half of the scene's.
     """
 
     scene: str
@@ -73,10 +75,13 @@ class RenderSpec:
     views: tuple[float, ...] = ()
     rig: tuple[float, float] | None = None
     by_world: bool = False
+    distance_m: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if self.scene not in SCENES:
             raise StereoweaveError(f"scene: expected one of {', '.join(SCENES)}, found {self.scene!r}")
+        if self.distance_m is not None:
+            _check_distance(self.distance_m, self.by_world)
         if self.rig is not None:
             try:
                 _centred_camera(*self.rig, self.size_px)
@@ -117,7 +122,7 @@ def draw_stage_and_rig(
 ) -> tuple[Stage, PosedRig]:
     """Draw the stage and rig of a frame; only the viewpoint differs between the frames of a sequence."""
     if spec.by_world:
-        stage, path = _draw_world(SCENES[spec.scene], _seed(spec, sequence))
+        stage, path = _draw_world(SCENES[spec.scene], _seed(spec, sequence), spec.distance_m)
         camera = _centred_camera(*(spec.rig or world_rig(spec.size_px)), spec.size_px)
         return stage, place_rig(stage.orbit, path.viewpoint(frame / FRAMES_PER_S), camera, spec.size_px)
     rng = np.random.default_rng(_seed(spec, sequence))
@@ -146,7 +151,7 @@ def draw_stage_and_rig(
 
 def draw_world_poses(spec: RenderSpec, world: int) -> list[Pose]:
     """Return the poses of the left cameras of all frames of a world, for a spec by world."""
-    stage, path = _draw_world(SCENES[spec.scene], _seed(spec, world))
+    stage, path = _draw_world(SCENES[spec.scene], _seed(spec, world), spec.distance_m)
     camera = _centred_camera(*(spec.rig or world_rig(spec.size_px)), spec.size_px)
     times_s = [frame / FRAMES_PER_S for frame in range(spec.frames)]
     rigs = [place_rig(stage.orbit, path.viewpoint(time_s), camera, spec.size_px) for time_s in times_s]
@@ -163,12 +168,27 @@ def world_rig(size_px: tuple[int, int]) -> tuple[float, float]:
 
 @lru_cache(maxsize=1)  # a renderer keeps what it has computed for the last world
 def _draw_world(
-    build: Callable[[np.random.Generator], Stage], seed: tuple[int, int, int]
+    build: Callable[[np.random.Generator], Stage],
+    seed: tuple[int, int, int],
+    distance_m: tuple[float, float] | None,
 ) -> tuple[Stage, CameraPath]:
     """Draw a world and the path of the camera in it."""
     rng = np.random.default_rng(seed)
     stage = build(rng)
-    return stage, draw_path(rng, stage.orbit)
+    return stage, draw_path(rng, stage.orbit, distance_m)
+
+
+def _check_distance(distance_m: tuple[float, float], by_world: bool) -> None:
+    if not by_world:
+        raise StereoweaveError(
+            f"expected none for a set without worlds, found {distance_m}", setting="distance_m"
+        )
+    near_m, far_m = distance_m
+    if not 0 < near_m <= far_m < np.inf:
+        raise StereoweaveError(
+            f"expected a least and a greatest distance above 0, found {near_m} and {far_m}",
+            setting="distance_m",
+        )
 
 
 def _seed(spec: RenderSpec, sequence: int) -> tuple[int, int, int]:

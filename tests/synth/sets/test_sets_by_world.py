@@ -4,6 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from dataset_examples import error_of
+from learn_examples import complaint
 from rich.console import Console
 from shard_examples import PaintedPairMaker, contents
 
@@ -88,6 +89,29 @@ def test_the_camera_stays_in_its_world_and_the_rig_is_elasticfusion_s_unless_giv
     _, given = draw_stage_and_rig(camera, replace(SPEC, rig=(50.0, 0.25)), 1)
     assert (given.camera.focal_px, given.camera.baseline_m) == (50.0, 0.25)
     np.testing.assert_allclose(given.eye_m(0.5), rigs[0].eye_m(0.5))
+
+
+def test_the_distance_from_the_target_may_be_given(camera):
+    near = replace(SPEC, distance_m=(6.0, 6.0))
+    stage, rig = draw_stage_and_rig(camera, near, 0, 3)
+    assert np.linalg.norm(rig.eye_m(0.5) - stage.orbit.centre_m) == pytest.approx(6)
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        (
+            {"distance_m": (3.0, 2.0)},
+            "distance_m: expected a least and a greatest distance above 0, found 3.0",
+        ),
+        ({"distance_m": (0.0, 2.0)}, "above 0, found 0.0 and 2.0"),
+        ({"distance_m": (1.0, float("inf"))}, "above 0, found 1.0 and inf"),
+        ({"distance_m": (1.0, float("nan"))}, "above 0, found 1.0 and nan"),
+        ({"distance_m": (1.0, 2.0), "by_world": False}, "distance_m: expected none for a set without worlds"),
+    ],
+)
+def test_an_invalid_distance_is_refused(changes, told):
+    assert told in complaint(lambda: replace(SPEC, **changes))
 
 
 def test_a_world_is_that_of_a_still_of_the_same_seed_and_number(camera):
