@@ -20,6 +20,7 @@ _PARAMETERS = {
     "calibration": "calib",
     "convergence_px": "convergence",
     "cpus_each": "threads",
+    "distance_m": "distance",
     "files": "write",
     "fov_deg": "fov",
     "lens_fov_deg": "lens_fov",

@@ -8,6 +8,7 @@ import typer
 
 from stereoweave.cli.commands import Commands, shows_steps
 from stereoweave.cli.options import Cluster, make_engine, parse_size_px, require_synth_extra
+from stereoweave.errors import StereoweaveError
 
 synth = Commands("Render and check stereo pairs with exact ground truth.")
 
@@ -25,10 +26,20 @@ Jobs = Annotated[int | None, typer.Option(min=1, help="Number of processes (defa
 @shows_steps
 def make(  # noqa: PLR0913 - each is an option of the command
     scene: Scene,
-    pairs: Annotated[int, typer.Option(min=1, help="Number of pairs in the finished set.")],
     out: Annotated[
         Path, typer.Option("--out", "-o", help="Folder of the set: a new one, or one to resume or extend.")
     ],
+    pairs: Annotated[
+        int | None, typer.Option(min=1, help="Number of pairs in the finished set, unless --worlds is given.")
+    ] = None,
+    worlds: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="Number of worlds in the finished set, each with one video of --frames pairs from a camera "
+            "that keeps moving around the target; the set also holds the camera's poses.",
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 0,
     size: Annotated[str, typer.Option(help="Width and height in pixels.")] = "640x480",
     plain: Annotated[
@@ -53,7 +64,15 @@ def make(  # noqa: PLR0913 - each is an option of the command
         typer.Option(
             metavar="FOCAL_PX BASELINE_M",
             help="Focal length in pixels and baseline in metres of all pairs (default: random for each "
-            "pair).",
+            "pair; with --worlds, 0.825 times the width, and 0.5 m).",
+        ),
+    ] = None,
+    distance: Annotated[
+        tuple[float, float] | None,
+        typer.Option(
+            metavar="NEAR_M FAR_M",
+            help="With --worlds, least and greatest distance of the cameras from the target's centre in "
+            "metres (default: the nearer half of the scene's).",
         ),
     ] = None,
     jobs: Annotated[
@@ -70,12 +89,20 @@ def make(  # noqa: PLR0913 - each is an option of the command
         from stereoweave.synth.sets.make import PairRenderer
         from stereoweave.synth.sets.make import make as make_set
         from stereoweave.synth.sets.pair_rendering import RenderSpec
+    count = _count_pairs(pairs, worlds, frames)
     spec = RenderSpec(
-        scene=scene, seed=seed, size_px=parse_size_px(size), frames=frames, views=tuple(view or ()), rig=rig
+        scene=scene,
+        seed=seed,
+        size_px=parse_size_px(size),
+        frames=frames,
+        views=tuple(view or ()),
+        rig=rig,
+        by_world=worlds is not None,
+        distance_m=distance,
     )
     pair_maker, engine = PairRenderer(plain), make_engine(cluster, workers=jobs)
-    made = make_set(spec, pairs, out, layout=layout, jobs=_jobs(jobs), engine=engine, pair_maker=pair_maker)
-    typer.echo(f"{out}: {made} pair{'s' * (made != 1)} made, {pairs - made} already there")
+    made = make_set(spec, count, out, layout=layout, jobs=_jobs(jobs), engine=engine, pair_maker=pair_maker)
+    typer.echo(f"{out}: {made} pair{'s' * (made != 1)} made, {count - made} already there")
 
 
 @synth.command()
@@ -142,6 +169,18 @@ def costs(
         from stereoweave.synth.sets.effect_costs import measure_effect_costs
     for cost in measure_effect_costs(scene, pairs):
         typer.echo(f"{cost.ms_a_pair:6.0f} ms  {cost.effect}")
+
+
+def _count_pairs(pairs: int | None, worlds: int | None, frames: int) -> int:
+    if worlds is None and pairs is not None:
+        return pairs
+    if pairs is None and worlds is not None:
+        return worlds * frames
+    raise StereoweaveError(
+        "expected a number of pairs, or of worlds with --frames pairs each, found "
+        f"{'neither' if pairs is None else 'both'}",
+        setting="pairs",
+    )
 
 
 def _jobs(jobs: int | None) -> int:

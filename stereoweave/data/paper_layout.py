@@ -36,7 +36,7 @@ _ENDINGS = {"left": "png", "right": "png", "calib": "txt", "depth": "png"}
 
 
 def list_paper(root: Path) -> list[Frame]:
-    """List the frames, such as scene/0001, with one file each in the folders left, right and depth.
+    """List the frames, such as scene/0001 or scene/world/0001, with a file each in left, right and depth.
 
     Cameras are in Middlebury's format. If there is a calib.txt beside the folders, it applies to all frames;
     otherwise, each frame has its own file, such as calib/scene/0001.txt.

@@ -34,6 +34,7 @@ DATASETS: dict[str, Callable[[Path], list[Frame]]] = {
     "middlebury2021": middlebury.list_middlebury2021,
     "eth3d": eth3d.list_eth3d,
     "paper": paper_layout.list_paper,
+    "paper_worlds": paper_layout.list_paper,
     "shards": shards.list_frames,
 }
 

@@ -54,9 +54,19 @@ def _choose_held_out(rule: dict[str, Any], frames: list[Frame]) -> set[str]:
         case {"last_share": share}:
             sequences = (list(group) for _, group in groupby(frames, key=lambda frame: frame.sequence))
             return {frame.name for run in sequences for frame in run[-_count(share, len(run)) :]}
+        case {"last_sequences": share}:
+            last = _choose_last(share, frames)
+            return {frame.name for frame in frames if frame.sequence in last}
         case {"names": patterns}:
             return {name for name in names if any(fnmatchcase(name, pattern) for pattern in patterns)}
     raise AssertionError(rule)
+
+
+def _choose_last(share: float, frames: list[Frame]) -> set[str]:
+    """Return the last sequences of every folder."""
+    sequences = sorted({frame.sequence for frame in frames})
+    folders = (list(group) for _, group in groupby(sequences, key=lambda name: name.rpartition("/")[0]))
+    return {name for folder in folders for name in folder[-_count(share, len(folder)) :]}
 
 
 def _count(share: float, frames: int) -> int:

@@ -104,4 +104,5 @@ def _find_common_recipe(networks: dict[str, Checkpoint]) -> Recipe:
 
 def identify_held_out(recipe: Recipe) -> tuple[object, ...]:
     """Return the settings that determine a recipe's held-out pairs; equal settings give equal pairs."""
-    return recipe.dataset, recipe.root, recipe.split, recipe.pair_size, recipe.validation_pairs
+    places = recipe.dataset, recipe.root, recipe.split, recipe.leave_out
+    return *places, recipe.pair_size, recipe.validation_pairs

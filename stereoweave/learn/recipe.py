@@ -79,6 +79,8 @@ class Recipe:
         mix: Training sets that replace the dataset, with their relative weights. A set is "collage" or a
             folder of rendered pairs (data/shards.py). Validation still uses the dataset.
         split: Key of SPLITS (data/splits.py), which divides frames into training and held-out frames.
+        leave_out: Another key of SPLITS, whose held-out frames are left out first: they are neither trained
+            on nor validated on, so that one network can be scored on both splits. Empty for none.
         pairs: Number of collage pairs to cache; every step crops them differently.
         fresh: Paint a new collage for each draw instead of caching pairs.
         pair_size: Height and width of a collage pair.
@@ -120,6 +122,7 @@ class Recipe:
     root: Text = ""
     mix: Weights = ()
     split: Text = "random"
+    leave_out: Text = ""
     pairs: Count = 4000
     fresh: Switch = False
     pair_size: Size = (320, 512)
@@ -210,6 +213,9 @@ def _find_contradiction(recipe: Recipe) -> str | None:
         return f"crop_size: expected at most pair_size = {limit}, found {found}"
     if recipe.mix and not collage:
         return f"mix: expected dataset = {COLLAGE!r} to validate the mix on, found {recipe.dataset!r}"
+    if recipe.leave_out and (collage or recipe.leave_out == recipe.split):
+        expected = "none for collages" if collage else f"a split other than split = {recipe.split!r}"
+        return f"leave_out: expected {expected}, found {recipe.leave_out!r}"
     if collage == bool(recipe.root):
         expected = "no folder" if collage else "the dataset's folder"
         return f"root: expected {expected}, found {recipe.root!r} with dataset = {recipe.dataset!r}"

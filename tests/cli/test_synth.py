@@ -113,6 +113,13 @@ def test_the_costs_of_the_effects_are_printed_in_milliseconds(monkeypatch, capsy
     [
         ("synth make cathedral --pairs 1 -o set", "scene: expected one of "),
         ("synth make pylon --pairs 0 -o set", "expected at least 1"),
+        (
+            "synth make pylon -o set",
+            "--pairs: expected a number of pairs, or of worlds with --frames pairs each, ",
+        ),
+        ("synth make pylon --frames 5 -o set", "pairs each, found neither"),
+        ("synth make pylon --pairs 6 --worlds 2 -o set", "pairs each, found both"),
+        ("synth make pylon --worlds 0 -o set", "expected at least 1"),
         ("synth make pylon --pairs -5 -o set", "expected at least 1"),
         ("synth make pylon --pairs 1 --seed -1 -o set", "expected at least 0"),
         ("synth make pylon --pairs 1 --frames 0 -o set", "expected at least 1"),

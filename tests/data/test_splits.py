@@ -40,6 +40,7 @@ EXAMPLES = {
     "middlebury2021": frames("artroom1", "traproom1", "traproom2"),
     "eth3d": frames("delivery_area_1l", "facade_1s", "forest_1s", "forest_2s"),
     "paper": frames(*run("mill", 20), *run("propeller", 40)),
+    "paper_worlds": frames(*(name for world in range(5) for name in run(f"propeller/{world:03d}", 6))),
     "shards": frames(*(f"ship/ship-{i:06d}" for i in range(30)), *(f"ship-{i:06d}" for i in range(10))),
 }
 
@@ -127,6 +128,21 @@ def test_scenes_are_held_out_whole(dataset, expected):
 def test_the_paper_s_scenes_lose_their_ends():
     _, held_out = names(split_frames(EXAMPLES["paper"], "paper", "disjoint"))
     assert held_out == ["mill/0018", "mill/0019", *(f"propeller/{i:04d}" for i in range(36, 40))]
+
+
+def test_worlds_are_held_out_whole():
+    training, held_out = names(split_frames(EXAMPLES["paper_worlds"], "paper_worlds", "disjoint"))
+    assert held_out == run("propeller/004", 6)
+    assert len(training) == 4 * 6
+
+
+def test_every_scene_loses_the_last_fifth_of_its_worlds_and_at_least_one():
+    worlds = [
+        f"{scene}/{number:03d}" for scene, count in (("pylon", 10), ("ship", 2)) for number in range(count)
+    ]
+    made = frames(*(name for world in worlds for name in run(world, 3)))
+    _, held_out = split_frames(made, "paper_worlds", "disjoint")
+    assert list(dict.fromkeys(frame.sequence for frame in held_out)) == ["pylon/008", "pylon/009", "ship/001"]
 
 
 def test_an_unknown_split_or_dataset_is_an_error_that_names_the_known_ones():

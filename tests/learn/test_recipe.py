@@ -157,6 +157,11 @@ def test_a_malicious_recipe_is_refused_at_once(tmp_path, text, found):
         ({"target": "height"}, "target: expected 'disparity' or 'depth', found 'height'"),
         ({"dataset": "sintel"}, "root: expected the dataset's folder, found '' with dataset = 'sintel'"),
         ({"root": "sintel"}, "root: expected no folder, found 'sintel' with dataset = 'collage'"),
+        ({"leave_out": "disjoint"}, "leave_out: expected none for collages, found 'disjoint'"),
+        (
+            {"leave_out": "random", "dataset": "sintel", "root": "sintel"},
+            "leave_out: expected a split other than split = 'random', found 'random'",
+        ),
         ({"mix": "collage"}, f"mix: {TABLE}, such as collage = 0.5, found 'collage'"),
         ({"mix": {"collage": "half"}}, f"mix: {TABLE}, such as collage = 0.5, found {{'collage': 'half'}}"),
         ({"mix": [["collage", 1, 2]]}, f"mix: {TABLE}, such as collage = 0.5, found [['collage', 1, 2]]"),

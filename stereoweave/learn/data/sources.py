@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Int
@@ -155,15 +155,34 @@ def open_sources(recipe: Recipe, folder: Path, whole: bool = False) -> tuple[Pai
             _mix_sets(recipe, collages) if recipe.mix else collages,
             CachedPairs(folder, VALIDATION_SEED, recipe.validation_pairs, recipe.pair_size),
         )
+    training, held_out, _ = divide_frames(recipe)
+    count = len(held_out) if whole else min(recipe.validation_pairs, len(held_out))
+    spread = np.linspace(0, len(held_out) - 1, count).round().astype(int)
+    return DatasetFrames(training), DatasetFrames([held_out[i] for i in spread])
+
+
+class FrameParts(NamedTuple):
+    """Frames of a dataset that a recipe trains on, holds out, and leaves out of both, each sorted by name."""
+
+    training: list[Frame]
+    held_out: list[Frame]
+    left_out: list[Frame]
+
+
+def divide_frames(recipe: Recipe) -> FrameParts:
+    """Divide the frames of a recipe's dataset on disk.
+
+    Raises:
+        StereoweaveError: The dataset or a split is unknown, the dataset is incomplete, or a part is empty.
+    """
     if recipe.dataset not in DATASETS:
         raise FormatError(
             f"{recipe.name}: dataset = {recipe.dataset!r}, expected one of {COLLAGE}, {', '.join(DATASETS)}"
         )
-    frames = open_dataset(recipe.dataset, recipe.root)
-    training, held_out = split_frames(frames, recipe.dataset, recipe.split)
-    count = len(held_out) if whole else min(recipe.validation_pairs, len(held_out))
-    spread = np.linspace(0, len(held_out) - 1, count).round().astype(int)
-    return DatasetFrames(training), DatasetFrames([held_out[i] for i in spread])
+    frames, left_out = open_dataset(recipe.dataset, recipe.root), list[Frame]()
+    if recipe.leave_out:
+        frames, left_out = split_frames(frames, recipe.dataset, recipe.leave_out)
+    return FrameParts(*split_frames(frames, recipe.dataset, recipe.split), left_out)
 
 
 def _open_collages(recipe: Recipe, folder: Path) -> PairSource:

@@ -15,6 +15,7 @@ from rich.console import Console
 
 from stereoweave.data.packing import pack
 from stereoweave.data.paper_layout import list_complete_frames, remove_unfinished, write_frame
+from stereoweave.data.poses import POSES_FOLDER, write_poses
 from stereoweave.data.shards import list_shards, write_shard
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io.files import make_folder, reading, remove_leftovers, replacing
@@ -22,7 +23,7 @@ from stereoweave.io.images import SMALLEST_SIDE_PX
 from stereoweave.io.output_lock import lock_output
 from stereoweave.io.run_folder import check_claim, check_unclaimed, describe_run
 from stereoweave.rendering.renderer import FIRST_POSITION, LAST_POSITION
-from stereoweave.synth.sets.pair_rendering import RenderedPair, RenderSpec, render_pair
+from stereoweave.synth.sets.pair_rendering import RenderedPair, RenderSpec, draw_world_poses, render_pair
 from stereoweave.synth.sets.renderers import shared_renderer
 from stereoweave.synth.sets.workers import count_step, run_in_engine, run_in_workers
 from stereoweave.system.ray_engine import Engine
@@ -36,7 +37,7 @@ _FRAMES_A_RUN = 4
 # The sample buffers of an image of this size take half a gigabyte.
 _LARGEST_SIDE_PX = 4096
 _EXCLUDED_SOURCES = {"make.py", "workers.py", "check.py", "contact_sheet.py", "effect_costs.py"}
-_ADDED_SOURCES = ("stereo.py", "data/samples.py", "data/packing.py", "data/paper_layout.py")
+_ADDED_SOURCES = ("stereo.py", "data/samples.py", "data/packing.py", "data/paper_layout.py", "data/poses.py")
 # Embree's and OpenGL's versions are part of the renderer's name.
 _PACKAGES = ("moderngl", "numpy", "opencv-python-headless", "pillow", "scikit-image")
 
@@ -76,15 +77,15 @@ class StorageFormat(NamedTuple):
     """A layout for storing pairs in a folder.
 
     Attributes:
-        whole_pairs: Function that returns the indices of a scene's complete pairs.
+        whole_pairs: Function that returns the indices of the complete pairs.
         write: Function that writes a run of pairs as they arrive.
         remove_unfinished: Function that deletes partly written files.
         pairs_a_run: Maximum number of pairs that a worker makes in one task; no run crosses a multiple of
             this number.
     """
 
-    whole_pairs: Callable[[Path, str], set[int]]
-    write: Callable[[Path, str, Sequence[int], Iterator[RenderedPair]], None]
+    whole_pairs: Callable[[Path, RenderSpec], set[int]]
+    write: Callable[[Path, RenderSpec, Sequence[int], Iterator[RenderedPair]], None]
     remove_unfinished: Callable[[Path], None]
     pairs_a_run: int
 
@@ -122,6 +123,8 @@ def make(  # noqa: PLR0913 - mirrors the command's options
     make_folder(out)
     with lock_output(out):
         _claim(out, _set_facts(spec, layout, pair_maker), pairs)
+        if spec.by_world:
+            _write_world_poses(out, spec, pairs)
         runs = _split_into_runs(_missing_pairs(spec, pairs, out, layout), LAYOUTS[layout].pairs_a_run)
         missing = sum(map(len, runs))
         progress = console or Console(), f"making {spec.scene}", missing
@@ -222,6 +225,9 @@ def _check(spec: RenderSpec, pairs: int, layout: str) -> None:
 
 def _set_facts(spec: RenderSpec, layout: str, pair_maker: PairMaker) -> dict[str, Any]:
     facts = {"format": FORMAT, "layout": layout, **asdict(spec)}
+    # Sets without worlds keep the description that they had before there were sets by world.
+    if not facts["by_world"]:
+        del facts["by_world"], facts["distance_m"]
     return facts | {"generator": generator_version(), "renderer": pair_maker.renderer()}
 
 
@@ -242,8 +248,15 @@ def _claim(out: Path, facts: dict[str, Any], pairs: int) -> None:
         temporary.write_text(describe_run(facts | {"pairs": pairs}), encoding="utf-8")
 
 
+def _write_world_poses(out: Path, spec: RenderSpec, pairs: int) -> None:
+    """Write the missing poses of the worlds of `pairs` pairs."""
+    for world in range(-(-pairs // spec.frames)):
+        if not (out / POSES_FOLDER / f"{_world_name(spec, world)}.txt").exists():
+            write_poses(out, _world_name(spec, world), draw_world_poses(spec, world))
+
+
 def _missing_pairs(spec: RenderSpec, pairs: int, out: Path, layout: str) -> list[int]:
-    return sorted(set(range(pairs)) - LAYOUTS[layout].whole_pairs(out, spec.scene))
+    return sorted(set(range(pairs)) - LAYOUTS[layout].whole_pairs(out, spec))
 
 
 def _prepare_node(
@@ -283,27 +296,40 @@ def _make_run(spec: RenderSpec, out: Path, layout: str, pair_maker: PairMaker, r
             yield pair_maker(spec, number)
             count_step()
 
-    LAYOUTS[layout].write(out, spec.scene, run, pairs())
+    LAYOUTS[layout].write(out, spec, run, pairs())
     return len(run)
 
 
-def _write_shard(out: Path, scene: str, run: Sequence[int], pairs: Iterator[RenderedPair]) -> None:
+def _write_shard(out: Path, spec: RenderSpec, run: Sequence[int], pairs: Iterator[RenderedPair]) -> None:
     packs = [pack(pair.sample, {place: shot.image for place, shot in pair.views}) for pair in pairs]
-    write_shard(out, scene, run[0], packs)
+    write_shard(out, spec.scene, run[0], packs)
 
 
-def _write_frames(out: Path, scene: str, run: Sequence[int], pairs: Iterator[RenderedPair]) -> None:
+def _write_frames(out: Path, spec: RenderSpec, run: Sequence[int], pairs: Iterator[RenderedPair]) -> None:
     for number, pair in zip(run, pairs, strict=True):
-        write_frame(out, f"{scene}/{number:06d}", pair.sample)
+        write_frame(out, _frame_name(spec, number), pair.sample)
 
 
-def _pairs_in_shards(out: Path, scene: str) -> set[int]:
-    return {number for shard in list_shards(out, scene) for number in range(shard.first, shard.last + 1)}
+def _pairs_in_shards(out: Path, spec: RenderSpec) -> set[int]:
+    shards = list_shards(out, spec.scene)
+    return {number for shard in shards for number in range(shard.first, shard.last + 1)}
 
 
-def _pairs_in_frames(out: Path, scene: str) -> set[int]:
-    names = (name.rpartition("/") for name in list_complete_frames(out))
-    return {int(number) for folder, _, number in names if folder == scene}
+def _pairs_in_frames(out: Path, spec: RenderSpec) -> set[int]:
+    parts = (name.split("/") for name in list_complete_frames(out))
+    places = [place for scene, *place in parts if scene == spec.scene and len(place) == 1 + spec.by_world]
+    return {int(place[-1]) + (int(place[0]) * spec.frames if spec.by_world else 0) for place in places}
+
+
+def _frame_name(spec: RenderSpec, number: int) -> str:
+    if not spec.by_world:
+        return f"{spec.scene}/{number:06d}"
+    world, frame = divmod(number, spec.frames)
+    return f"{_world_name(spec, world)}/{frame:06d}"
+
+
+def _world_name(spec: RenderSpec, world: int) -> str:
+    return f"{spec.scene}/{world:03d}"
 
 
 def _tidy_frames(out: Path) -> None:

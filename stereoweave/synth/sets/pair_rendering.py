@@ -3,14 +3,17 @@
 import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from stereoweave.data.poses import Pose
 from stereoweave.data.samples import make_sample
 from stereoweave.errors import StereoweaveError
 from stereoweave.stereo import Sample, StereoCamera, StereoPair
+from stereoweave.synth.camera_paths import FRAMES_PER_S, CameraPath, draw_path
 from stereoweave.synth.scenes import SCENES
 from stereoweave.synth.stage import Stage
 from stereoweave.synth.viewpoints import (
@@ -30,6 +33,9 @@ _NEAREST_SHARE = 0.01
 _WIRE_SHARE, _EXCESS = 0.002, 1.25
 # A small image suffices to find the nearest surface.
 _LOOK_WIDTH_PX = 160
+# Default rig of sets by world. The focal length, for images 640 px wide, is that of ElasticFusion's default
+# camera; the paper gives neither number.
+_WORLD_FOCAL_PX, _WORLD_BASELINE_M = 528, 0.5
 
 
 @runtime_checkable
@@ -54,7 +60,12 @@ class RenderSpec:
         size_px: Width and height of the images.
         frames: Number of consecutive pairs that form a video of one world from a moving camera; 1 for stills.
         views: Positions of additional views between or beyond the two cameras, such as 0.5.
-        rig: Focal length in pixels and baseline in metres of all pairs; if None, both are drawn per world.
+        rig: Focal length in pixels and baseline in metres of all pairs; if None, both are drawn per world, or
+            `world_rig` if the set is by world.
+        by_world: Whether the camera of a video keeps moving around the target (`camera_paths`), instead of
+            crossing a part of the orbit once, from a start to an end. Pairs are then named after their world.
+        distance_m: Least and greatest distance of the cameras from the target's centre, in a set by world; if
+            None, the nearer half of the scene's.
     """
 
     scene: str
@@ -63,10 +74,14 @@ class RenderSpec:
     frames: int = 1
     views: tuple[float, ...] = ()
     rig: tuple[float, float] | None = None
+    by_world: bool = False
+    distance_m: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if self.scene not in SCENES:
             raise StereoweaveError(f"scene: expected one of {', '.join(SCENES)}, found {self.scene!r}")
+        if self.distance_m is not None:
+            _check_distance(self.distance_m, self.by_world)
         if self.rig is not None:
             try:
                 _centred_camera(*self.rig, self.size_px)
@@ -106,6 +121,10 @@ def draw_stage_and_rig(
     renderer: SceneRenderer, spec: RenderSpec, sequence: int, frame: int = 0
 ) -> tuple[Stage, PosedRig]:
     """Draw the stage and rig of a frame; only the viewpoint differs between the frames of a sequence."""
+    if spec.by_world:
+        stage, path = _draw_world(SCENES[spec.scene], _seed(spec, sequence), spec.distance_m)
+        camera = _centred_camera(*(spec.rig or world_rig(spec.size_px)), spec.size_px)
+        return stage, place_rig(stage.orbit, path.viewpoint(frame / FRAMES_PER_S), camera, spec.size_px)
     rng = np.random.default_rng(_seed(spec, sequence))
     stage = SCENES[spec.scene](rng)
     focal_px = draw_focal_px(rng, spec.size_px[0])
@@ -128,6 +147,48 @@ def draw_stage_and_rig(
     share = frame / max(spec.frames - 1, 1)
     camera = _centred_camera(focal_px, baseline_m, spec.size_px)
     return stage, place_rig(stage.orbit, interpolate_viewpoints(start, end, share), camera, spec.size_px)
+
+
+def draw_world_poses(spec: RenderSpec, world: int) -> list[Pose]:
+    """Return the poses of the left cameras of all frames of a world, for a spec by world."""
+    stage, path = _draw_world(SCENES[spec.scene], _seed(spec, world), spec.distance_m)
+    camera = _centred_camera(*(spec.rig or world_rig(spec.size_px)), spec.size_px)
+    times_s = [frame / FRAMES_PER_S for frame in range(spec.frames)]
+    rigs = [place_rig(stage.orbit, path.viewpoint(time_s), camera, spec.size_px) for time_s in times_s]
+    return [
+        Pose(time_s=time_s, position_m=rig.position_m, axes=rig.axes)
+        for time_s, rig in zip(times_s, rigs, strict=True)
+    ]
+
+
+def world_rig(size_px: tuple[int, int]) -> tuple[float, float]:
+    """Return the default rig of sets by world: focal length in pixels and baseline in metres."""
+    return _WORLD_FOCAL_PX * size_px[0] / 640, _WORLD_BASELINE_M
+
+
+@lru_cache(maxsize=1)  # a renderer keeps what it has computed for the last world
+def _draw_world(
+    build: Callable[[np.random.Generator], Stage],
+    seed: tuple[int, int, int],
+    distance_m: tuple[float, float] | None,
+) -> tuple[Stage, CameraPath]:
+    """Draw a world and the path of the camera in it."""
+    rng = np.random.default_rng(seed)
+    stage = build(rng)
+    return stage, draw_path(rng, stage.orbit, distance_m)
+
+
+def _check_distance(distance_m: tuple[float, float], by_world: bool) -> None:
+    if not by_world:
+        raise StereoweaveError(
+            f"expected none for a set without worlds, found {distance_m}", setting="distance_m"
+        )
+    near_m, far_m = distance_m
+    if not 0 < near_m <= far_m < np.inf:
+        raise StereoweaveError(
+            f"expected a least and a greatest distance above 0, found {near_m} and {far_m}",
+            setting="distance_m",
+        )
 
 
 def _seed(spec: RenderSpec, sequence: int) -> tuple[int, int, int]:

@@ -18,6 +18,7 @@ from stereoweave.learn.data.sources import (
     MixedSource,
     PairSource,
     cache_pairs,
+    divide_frames,
     open_held_out_sets,
     open_sources,
 )
@@ -88,6 +89,17 @@ def test_the_split_is_that_of_the_recipe(recipe, tmp_path):
     training, held_out = open_sources(replace(recipe, split="random"), tmp_path)
     assert sorted(names(training) + names(held_out)) == FRAMES
     assert names(held_out) != FRAMES[36:]
+
+
+def test_frames_that_are_left_out_are_neither_trained_on_nor_held_out(recipe, tmp_path):
+    """The disjoint split holds out the last 4 of 40 frames; a tenth of the other 36 is drawn at random."""
+    training, held_out, left_out = divide_frames(replace(recipe, split="random", leave_out="disjoint"))
+    assert [frame.name for frame in left_out] == FRAMES[36:]
+    assert len(held_out) == 4
+    assert sorted(frame.name for frame in (*training, *held_out)) == FRAMES[:36]
+    opened = open_sources(replace(recipe, split="random", leave_out="disjoint"), tmp_path)
+    assert [part.count for part in opened] == [32, 4]
+    assert divide_frames(recipe).left_out == []
 
 
 def test_a_frame_is_read_on_demand(recipe, tmp_path):

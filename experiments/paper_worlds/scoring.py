@@ -1,0 +1,164 @@
+"""Scores of networks on frames of the worlds that they trained on, and on frames of worlds never seen."""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from stereoweave.bench.projected_views import DisparityMethod, ProjectionRow, score_projections
+from stereoweave.data.frames import Frame
+from stereoweave.data.poses import Pose, find_nearest_frames, read_poses
+from stereoweave.errors import StereoweaveError
+from stereoweave.learn import checkpoint
+from stereoweave.learn.checkpoint import Checkpoint
+from stereoweave.learn.data.sources import DatasetFrames, divide_frames
+from stereoweave.learn.evaluation import MEDIAN, identify_held_out, make_median_method, make_method
+from stereoweave.learn.recipe import Recipe
+
+NEAREST = "nearest frame"
+# The dataset whose frames have poses.
+WORLDS = "paper_worlds"
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorldsRow:
+    """Mean scores of one method on the held-out frames of one split.
+
+    Attributes:
+        split: The recipe's split, whose held-out frames are of the worlds of its training; or the split that
+            it leaves out, whose frames are of other worlds.
+        method: Name of a run; a baseline of `score_projections`; "median", the training pairs' median
+            disparity; or "nearest frame", the true depth of the training frame whose camera is nearest.
+        pairs: Number of scored pairs.
+        steps: Training steps of a run; 0 for all other methods.
+        nearest_m: Mean distance between the left cameras of a scored pair and of its nearest training frame.
+        epe_cm, epe_px, mae_sourced, sourced_percent, mae_filled, psnr_db, ssim: See `ProjectionRow`.
+        epe_cm_sd: Standard deviation of `epe_cm` over the pairs.
+    """
+
+    split: str
+    method: str
+    pairs: int
+    steps: int
+    nearest_m: float
+    epe_cm: float
+    epe_cm_sd: float
+    epe_px: float
+    mae_sourced: float
+    sourced_percent: float
+    mae_filled: float
+    psnr_db: float
+    ssim: float
+
+
+def score_worlds(runs: Sequence[Path], most: int | None = None) -> Iterator[WorldsRow]:
+    """Score runs, and methods without training, on the held-out frames and on those of left-out worlds.
+
+    Args:
+        runs: Run folders of `stereoweave train`, or checkpoints, all with the same held-out pairs of a set by
+            world, and a split that they leave out.
+        most: Greatest number of frames to score per split, evenly spread; None for all.
+
+    Raises:
+        StereoweaveError: The runs have different pairs, do not leave out a split, or share a name; or the set
+            is incomplete.
+    """
+    kept = {(run if run.is_dir() else run.with_suffix("")).name: _load(run) for run in runs}
+    if len(kept) < len(runs):
+        raise StereoweaveError("runs: expected different names, found a duplicate; rename a run")
+    recipe = _find_common_recipe({name: one.recipe for name, one in kept.items()})
+    training, *parts = divide_frames(recipe)
+    methods = {MEDIAN: make_median_method(DatasetFrames(training))}
+    methods |= {name: make_method(one) for name, one in kept.items()}
+    scorer = WorldScorer(recipe.max_depth_m, training, read_poses(Path(recipe.root)), methods)
+    for split, frames in zip((recipe.split, recipe.leave_out), parts, strict=True):
+        for row in scorer.score(_spread(frames, most)):
+            found = kept.get(row["method"])
+            yield WorldsRow(split=split, steps=found.step if found else 0, **row)
+
+
+@dataclass(frozen=True)
+class WorldScorer:
+    """Scorer of methods, among them the nearest of the training frames, on other frames of the same set.
+
+    Attributes:
+        max_depth_m: Depth of training frames where it is unknown, and maximum of estimated depths.
+        training: Frames among which the nearest one is searched.
+        poses: Poses of all frames, by name.
+        methods: Further methods, by name.
+    """
+
+    max_depth_m: float
+    training: Sequence[Frame]
+    poses: Mapping[str, Pose]
+    methods: Mapping[str, DisparityMethod]
+
+    def score(self, frames: Sequence[Frame]) -> Iterator[dict[str, Any]]:
+        """Yield the columns of `WorldsRow`, except split and steps, for each method."""
+        by_name = {frame.name: frame for frame in self.training}
+        nearest = find_nearest_frames([frame.name for frame in frames], list(by_name), self.poses)
+        rows = [self._score_frame(frame, by_name[nearest[frame.name]]) for frame in frames]
+        pairs = (
+            (self.poses[name].position_m, self.poses[other].position_m) for name, other in nearest.items()
+        )
+        nearest_m = float(np.mean([np.linalg.norm(one - other) for one, other in pairs]))
+        for of_method in zip(*rows, strict=True):
+            yield {
+                **_average(of_method),
+                "pairs": len(frames),
+                "nearest_m": nearest_m,
+                "epe_cm_sd": float(np.std([row.epe_cm for row in of_method])),
+            }
+
+    def _score_frame(self, frame: Frame, nearest: Frame) -> list[ProjectionRow]:
+        sample, nearest_px = frame.read(), self._read_truth_px(nearest)
+        methods = {NEAREST: lambda _: nearest_px, **self.methods}
+        return score_projections(methods, [sample], self.max_depth_m)
+
+    def _read_truth_px(self, frame: Frame) -> Float[np.ndarray, "h w"]:
+        """Return the true disparity of a frame; where it is unknown, that of the greatest depth."""
+        sample = frame.read()
+        if sample.camera is None:
+            raise StereoweaveError(f"{frame.name}: expected a camera, found none")
+        farthest_px = sample.camera.disparity_px(np.full_like(sample.disparity_px, self.max_depth_m))
+        return np.where(np.isfinite(sample.disparity_px), sample.disparity_px, farthest_px)
+
+
+def _load(run: Path) -> Checkpoint:
+    return checkpoint.load(run / "last.pt" if run.is_dir() else run)
+
+
+def _find_common_recipe(recipes: Mapping[str, Recipe]) -> Recipe:
+    """Return the first recipe. Raises StereoweaveError if another one has different pairs, or no worlds."""
+    first, *others = recipes
+    recipe = recipes[first]
+    if recipe.dataset != WORLDS or not recipe.leave_out:
+        raise StereoweaveError(
+            f"{first}: expected a run with dataset = {WORLDS!r} and a split in leave_out, found dataset = "
+            f"{recipe.dataset!r} and leave_out = {recipe.leave_out!r}; "
+            "train recipes/paper/propeller_worlds.toml"
+        )
+    for name in others:
+        if identify_held_out(recipes[name]) != identify_held_out(recipe):
+            raise StereoweaveError(
+                f"{name}: expected the held-out pairs of {first}, {identify_held_out(recipe)}, found "
+                f"{identify_held_out(recipes[name])}; score this run separately"
+            )
+    return recipe
+
+
+def _spread(frames: Sequence[Frame], most: int | None) -> list[Frame]:
+    count = min(most or len(frames), len(frames))
+    return [frames[i] for i in np.linspace(0, len(frames) - 1, count).round().astype(int)]
+
+
+def _average(rows: Iterable[ProjectionRow]) -> dict[str, Any]:
+    """Return the mean of each number, and the method that the rows have in common."""
+    columns = [asdict(row) for row in rows]
+    return {
+        name: value if name == "method" else float(np.mean([column[name] for column in columns]))
+        for name, value in columns[0].items()
+    }
