@@ -21,7 +21,7 @@ SLOPES = 0.5
 """Greatest change of slope of the first changed label."""
 NEARBY_PX = 24
 """Farthest that a label comes from, along each axis."""
-DRAWS = 6
+DRAWS = 4
 """Random numbers for each proposal."""
 
 

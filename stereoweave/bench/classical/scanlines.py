@@ -1,10 +1,10 @@
 """Dynamic programming along scanlines, with occlusions.
 
-After "Dynamic programming for multi-view disparity/depth estimation" (Anantrasirichai, Canagarajah, Redmill and Bull
-2006), which the paper cites: the costs of windows of adaptive size and place, and the smoothness within the dynamic
-programming. Its recurrence is that of Bobick and Intille ("Large occlusion stereo", 1999) and Cox and others ("A
-maximum likelihood stereo algorithm", 1996): each pixel of a row is matched with one of the right row, in order, or
-passed over at a fixed cost.
+It follows "Dynamic programming for multi-view disparity/depth estimation" (Anantrasirichai, Canagarajah,
+Redmill and Bull 2006), which the paper cites: windows of adaptive size and place give the costs, and
+smoothness is part of the dynamic programming. The recurrence is that of Cox and others ("A maximum likelihood
+stereo algorithm", 1996) and Bobick and Intille ("Large occlusion stereo", 1999): each pixel of a row is
+matched with a pixel of the right row, in order, or passed over at a fixed cost.
 """
 
 import numpy as np

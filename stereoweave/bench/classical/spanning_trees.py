@@ -1,18 +1,18 @@
 """3DMST: aggregation of costs over minimum spanning trees, for labels that are planes.
 
-Li, Yu, Zhang, Zhao and Zhang, "3D cost aggregation with multiple minimum spanning trees for stereo matching", Applied
-Optics 56 (2017). A pixel's support is a minimum spanning tree, not a square window; its label is a plane, not a
-disparity; and as no tree can be tried with all planes, there are many trees, and a random search in the manner of
-PatchMatch proposes a few planes to each of them.
+Li, Yu, Zhang, Zhao and Zhang, "3D cost aggregation with multiple minimum spanning trees for stereo matching",
+Applied Optics 56 (2017). A pixel's support is a minimum spanning tree in place of a square, and its label is
+a plane in place of a disparity. There are too many planes to try them all: each area of the image has a tree
+of its own, to which a random search in the manner of PatchMatch proposes planes.
 
-The paper sells its full text, and this is written from its abstract and from the papers that it builds on:
-Yang (2012) for trees and aggregation, Felzenszwalb and Huttenlocher (2004) for the areas that get a tree each,
-Bleyer, Rhemann and Rother ("PatchMatch stereo", 2011) for proposals and post-processing. It differs in three ways:
+This is written from the paper's abstract, because its text is not public, and from what it builds on: Yang
+(2012) for trees and aggregation, Felzenszwalb and Huttenlocher (2004) for the areas, Bleyer, Rhemann and
+Rother ("PatchMatch stereo", 2011) for proposals and post-processing. Known differences:
 
-- The first labels are the best of all whole disparities, not random ones. All of them together take as long as about
-  twenty random planes, because they are aggregated at once.
+- The first labels are the best of all whole disparities, not random ones, because these are fast to try: all
+  candidates are aggregated at once.
 - Some proposals are planes through the disparities of three of the tree's pixels.
-- Matching costs are census and colour; the paper's are those of MC-CNN. `find_costs` takes any others.
+- Matching costs are census and colour. The paper's are those of MC-CNN; `find_costs` takes any others.
 """
 
 import numpy as np
@@ -80,9 +80,7 @@ def find_planes(
     return labels[at_pixel]
 
 
-def _list_places(
-    forest: Forest, size: tuple[int, int]
-) -> tuple[Float32[np.ndarray, "n 2"], np.ndarray]:
+def _list_places(forest: Forest, size: tuple[int, int]) -> tuple[Float32[np.ndarray, "n 2"], np.ndarray]:
     """Return the row and column of the pixel at each place, and the place of each pixel [H, W]."""
     places = np.stack(np.divmod(forest.order, size[1]), 1).astype(np.float32)
     at_pixel = np.empty(len(places), np.int64)

@@ -30,8 +30,8 @@ class Forest(NamedTuple):
 def grow_forest(image: UInt8[np.ndarray, "h w 3"]) -> Forest:
     """Return the minimum spanning trees of the image's areas.
 
-    The weight of an edge is the greatest difference of its two pixels in a channel, after a 3x3 median (Yang, "A
-    non-local cost aggregation method for stereo matching", 2012).
+    The weight of an edge is the greatest difference of its two pixels in a channel, after a 3x3 median (Yang,
+    "A non-local cost aggregation method for stereo matching", 2012).
     """
     from stereoweave.bench.classical import tree_kernels as kernels  # it loads LLVM
 
@@ -55,6 +55,8 @@ def _list_edges(
     numbers = np.arange(image.shape[0] * image.shape[1], dtype=np.int32).reshape(image.shape[:2])
     across, down = (np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])
     ends = [np.stack([numbers[one].ravel(), numbers[other].ravel()], 1) for one, other in (across, down)]
-    weights = [cv2.absdiff(image[one], image[other]).max(-1, initial=0).ravel() for one, other in (across, down)]
+    weights = [
+        cv2.absdiff(image[one], image[other]).max(-1, initial=0).ravel() for one, other in (across, down)
+    ]
     order = np.argsort(np.concatenate(weights), kind="stable")
     return np.concatenate(ends)[order], np.concatenate(weights)[order]

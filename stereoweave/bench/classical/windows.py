@@ -1,17 +1,15 @@
 """Block matching with an adaptive window.
 
-The paper's related work names block matching, and its authors' dynamic programming (Anantrasirichai, Canagarajah,
-Redmill and Bull 2006) correlates windows of adaptive size that may be shifted. Size and place are chosen here for
-each pixel and candidate as follows:
+Size and place of a window are chosen for each pixel and candidate, as the dynamic programming does that the
+paper cites (`scanlines`):
 
 - The cost of a window is that of Veksler ("Fast variable window for stereo correspondence using integral
-  images", 2003): the mean of the matching costs, plus a share of their variance, which is large in windows across a
-  depth edge, plus a penalty that falls with the size, which prefers large windows on plain surfaces.
-- A window may have the pixel at its centre, in a corner or in the middle of a side (the nine shiftable windows of
-  Bobick and Intille, "Large occlusion stereo", 1999).
+  images", 2003): the mean of the matching costs, plus a share of their variance, which is large in windows
+  across a depth edge, plus a penalty that falls with the size, which prefers large windows on plain surfaces.
+- A pixel may be at the centre of the window, in a corner or in the middle of a side (the nine shiftable
+  windows of Bobick and Intille, "Large occlusion stereo", 1999).
 
-The window of least cost decides. Veksler searches rectangles; squares of four sizes are enough for a difference
-that stays below that of the three matchers.
+The window of least cost decides. Veksler searches rectangles; here are squares of four sizes.
 """
 
 import numpy as np
@@ -46,7 +44,7 @@ def find_window_costs(costs: UInt8[np.ndarray, "h w d"]) -> UInt16[np.ndarray, "
 def match_windows(
     pair: StereoPair, find_costs: CostFunction = match_census_and_colour
 ) -> Float32[np.ndarray, "h w"]:
-    """Return the left disparity in px [H, W] of each pixel's best window; -1 where the right view disagrees."""
+    """Return the left disparity in px [H, W] of the best windows; -1 where the right view disagrees."""
     costs = find_window_costs(find_costs(pair))
     return keep_agreed(_pick(costs), _pick(see_from_right(costs)))
 
