@@ -130,14 +130,15 @@ def _lay_plane(labels, places, corners, proposal):
 
 @inlined
 @typing.no_type_check
-def _cost(costs, disparity_px):
-    """Return the matching cost at a disparity, between those of the two nearest whole ones."""
-    last = costs.shape[0] - 1
+def _cost(costs, at, disparity_px):
+    """Return a place's matching cost at a disparity, between those of the two nearest whole ones."""
+    last = costs.shape[1] - 1
     if not 0 <= disparity_px <= last:
         return OUTSIDE
     below = min(np.int64(disparity_px), last - 1)
     share = disparity_px - np.float32(below)
-    return costs[below] + share * (np.float32(costs[below + 1]) - np.float32(costs[below]))
+    lower, upper = np.float32(costs[at, below]), np.float32(costs[at, below + 1])
+    return lower + share * (upper - lower)
 
 
 @compiled
@@ -150,7 +151,7 @@ def _try_label(proposal, costs, places, parents, similarity, start, sums, labels
         sums[i] = 0
     for i in range(pixels - 1, -1, -1):
         at = start + i
-        sums[i] += _cost(costs[at], a * places[at, 1] + b * places[at, 0] + c)
+        sums[i] += _cost(costs, at, a * places[at, 1] + b * places[at, 0] + c)
         if i > 0:
             sums[parents[at] - start] += similarity[at] * sums[i]
     for i in range(pixels):
