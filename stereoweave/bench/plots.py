@@ -13,6 +13,7 @@ from matplotlib.text import Annotation
 from matplotlib.ticker import FormatStrFormatter, LogLocator, NullLocator
 from matplotlib.transforms import Bbox
 
+from stereoweave.bench.classical.matchers import CLASSICAL_MATCHERS
 from stereoweave.bench.metrics import DROPPED_PERCENT, Sparsification
 from stereoweave.bench.opencv_matchers import OPENCV_MATCHERS
 from stereoweave.bench.tables import Curves, MatcherRow
@@ -88,7 +89,7 @@ def _make_panels() -> tuple[Figure, dict[str, Axes]]:
 
 
 def _choose_marker(row: MatcherRow) -> dict[str, Any]:
-    if row.matcher in OPENCV_MATCHERS:
+    if row.matcher in (*OPENCV_MATCHERS, *CLASSICAL_MATCHERS):
         return {"marker": "s", "color": "0.45", "linestyle": ""}
     return {"marker": "o", "color": _COLOURS[0], "linestyle": ""}
 
@@ -98,7 +99,8 @@ def _short_name(matcher: str) -> str:
 
 
 def _legend_entry(matcher: str) -> str:
-    return f"{matcher}, by its left-right check" if matcher in OPENCV_MATCHERS else _short_name(matcher)
+    checked = matcher in (*OPENCV_MATCHERS, *CLASSICAL_MATCHERS)
+    return f"{matcher}, by its left-right check" if checked else _short_name(matcher)
 
 
 def _label(axes: Axes, points: Mapping[str, tuple[float, float]]) -> None:

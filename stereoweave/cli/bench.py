@@ -68,6 +68,13 @@ Models = Annotated[
     list[str] | None,
     typer.Option(help="Network, as for stereoweave depth. Repeatable (default: all shipped networks)."),
 ]
+MatcherNames = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="Classical matcher to score beside OpenCV's: adaptive_window, dynamic_programming or 3dmst. "
+        "Repeatable. With it, networks are scored only if --model names them."
+    ),
+]
 
 bench = Commands("Score matchers, new views, videos and trained networks.")
 
@@ -78,6 +85,7 @@ def pairs(  # noqa: PLR0913 - each is an option of the command line
     folder: ScenesFolder,
     out: CsvFile = Path("pairs.csv"),
     model: Models = None,
+    matchers: MatcherNames = None,
     dataset: Dataset = None,
     plot: Plot = None,
     sparsification: SparsificationPlot = None,
@@ -86,7 +94,7 @@ def pairs(  # noqa: PLR0913 - each is an option of the command line
     threads: Threads = None,
     provider: Provider = "cpu",
 ) -> None:
-    """Score networks and OpenCV's matchers on known disparity.
+    """Score networks and classical matchers on known disparity.
 
     Scores cover errors, edges, confidence, time and memory. With --cluster, each scene is scored by one
     worker with --threads cores (default: 1), so that the times of all matchers on a scene are comparable.
@@ -94,6 +102,7 @@ def pairs(  # noqa: PLR0913 - each is an option of the command line
     """
     import cv2
 
+    from stereoweave.bench.classical.matchers import make_classical_matcher
     from stereoweave.bench.opencv_matchers import SGBM
     from stereoweave.bench.pairs import add_memory, score_pairs
     from stereoweave.bench.tables import MEAN, write_csv
@@ -106,7 +115,9 @@ def pairs(  # noqa: PLR0913 - each is an option of the command line
     engine = make_engine(cluster, cpus_each=threads or 1)
     threads = engine.threads_each if engine else threads
     cv2.setNumThreads(thread_count(threads))
-    makers = _list_makers(model, threads, provider)
+    makers = {name: partial(make_classical_matcher, name) for name in matchers or ()}
+    if model or not matchers:
+        makers |= _list_makers(model, threads, provider)
     scores = score_pairs(makers, partial(list_scenes, folder.absolute(), dataset), engine)
     rows = add_memory(scores.rows, makers, scores.largest)
     write_csv(out, rows, scores.machine)

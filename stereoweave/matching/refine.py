@@ -75,6 +75,20 @@ def refine(
     )
 
 
+def find_matching_costs(pair: StereoPair, count: int) -> UInt8[np.ndarray, "h w d"]:
+    """Return the left view's matching costs without a network's disparity, 0..108 [H, W, count].
+
+    Candidate i is a disparity of i px. Matches outside the right image are compared with its border column.
+    """
+    from stereoweave.matching import refine_kernels as kernels  # it loads LLVM
+
+    nothing = np.zeros(pair.left.shape[:2], np.float32)
+    own, other = (_cues(image, nothing, nothing) for image in (pair.left, pair.right))
+    costs = np.empty((*nothing.shape, count), np.uint8)
+    kernels.match(own, _reverse_columns(other, 0, count), 0, len(costs), costs)
+    return costs
+
+
 def rehearse_refining() -> None:
     """Refine a small estimate, to compile all kernels (`compiling_ahead.compile_ahead`)."""
     image, px = np.zeros((32, 32, 3), np.uint8), np.zeros((32, 32), np.float32)

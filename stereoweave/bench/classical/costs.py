@@ -1,0 +1,50 @@
+"""What the classical matchers share: matching costs, the right view's costs, and the left-right check."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, Shaped, UInt8
+
+from stereoweave.bench.opencv_matchers import DISPARITIES
+from stereoweave.matching.left_right_check import OCCLUSION_STEP_PX, measure_disagreement
+from stereoweave.matching.refine import find_matching_costs
+from stereoweave.stereo import StereoPair
+
+HOLE = np.float32(-1)
+"""Disparity of a pixel that has none."""
+
+CostFunction = Callable[[StereoPair], UInt8[np.ndarray, "h w d"]]
+"""Returns the left view's matching costs [H, W, D]: candidate i is a disparity of i px, and low is good."""
+
+
+def match_census_and_colour(pair: StereoPair) -> UInt8[np.ndarray, "h w d"]:
+    """Return the costs that the networks' refinement uses, 0..108 [H, W, 192].
+
+    A cost is half the difference in colour, which is insensitive to sampling (Birchfield and Tomasi 1998) and
+    limited to 60, plus two for each of the 24 pixels around that the census compares otherwise.
+    """
+    return find_matching_costs(pair, DISPARITIES)
+
+
+def see_from_right(costs: Shaped[np.ndarray, "h w d"]) -> Shaped[np.ndarray, "h w d"]:
+    """Return the costs of the right view: candidate i of column x is that of column x + i of the left view.
+
+    Candidates outside the left image get the greatest value of the array's type.
+    """
+    count = costs.shape[2]
+    worst: Any = np.iinfo(costs.dtype).max
+    padded = np.pad(costs, ((0, 0), (0, count - 1), (0, 0)), constant_values=worst)
+    rows, columns, candidates = padded.strides
+    return np.lib.stride_tricks.as_strided(
+        padded, costs.shape, (rows, columns, columns + candidates), writeable=False
+    ).copy()
+
+
+def keep_agreed(
+    disparity_px: Float32[np.ndarray, "h w"], right_disparity_px: Float32[np.ndarray, "h w"]
+) -> Float32[np.ndarray, "h w"]:
+    """Return the left disparity, with a hole where the right view disagrees by more than 1 px."""
+    disagreement_px, inside = measure_disagreement(disparity_px, right_disparity_px)
+    agreed = inside & (np.abs(disagreement_px) <= OCCLUSION_STEP_PX)
+    return np.where(agreed, disparity_px, HOLE)

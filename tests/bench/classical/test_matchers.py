@@ -1,0 +1,73 @@
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from stereoweave.bench.classical.matchers import CLASSICAL_MATCHERS, make_classical_matcher
+from stereoweave.bench.opencv_matchers import OPENCV_MATCHERS
+from stereoweave.cli.root import main
+from stereoweave.errors import StereoweaveError
+from stereoweave.stereo import StereoPair
+
+
+@pytest.fixture
+def dots(rng):
+    """Return a pair of random dots at 7 px."""
+    image = rng.integers(0, 256, (48, 107, 3), dtype=np.uint8)
+    return StereoPair(left=image[:, :100].copy(), right=image[:, 7:].copy())
+
+
+@pytest.mark.parametrize("name", CLASSICAL_MATCHERS)
+def test_each_finds_the_disparity_of_random_dots(dots, name):
+    disparity_px = make_classical_matcher(name)(dots)
+    assert disparity_px.shape == (48, 100)
+    assert disparity_px.dtype == np.float32
+    np.testing.assert_allclose(disparity_px[4:-4, 14:-4], 7, atol=0.25)
+
+
+def test_an_unknown_matcher_is_named_with_those_that_are_known():
+    with pytest.raises(StereoweaveError, match="adaptive_window, dynamic_programming, 3dmst, found 'words'"):
+        make_classical_matcher("words")
+
+
+@pytest.fixture
+def scenes(dots, tmp_path):
+    scene = tmp_path / "scenes" / "dots"
+    scene.mkdir(parents=True)
+    Image.fromarray(dots.left).save(scene / "left.png")
+    Image.fromarray(dots.right).save(scene / "right.png")
+    Image.fromarray(np.full((48, 100), 7 * 256, np.uint16)).save(scene / "disparity.png")
+    return scene.parent
+
+
+def test_bench_pairs_scores_named_matchers_beside_opencv_s_and_no_network(scenes, tmp_path, capfd):
+    rows = tmp_path / "rows.csv"
+    command = f"bench pairs {scenes} --matchers 3dmst --matchers adaptive_window -o {rows}"
+    assert main([*command.split(), "--sparsification", f"{tmp_path}/curves.png"]) == 0
+    with rows.open() as file:
+        found = {row["matcher"]: row for row in csv.DictReader(file) if row["scene"] == "mean"}
+    assert list(found) == [*OPENCV_MATCHERS, "3dmst", "adaptive_window"]
+    assert float(found["3dmst"]["bad2_percent"]) < 10
+    assert "3dmst" in capfd.readouterr().out
+
+
+def test_bench_pairs_scores_a_network_too_if_it_is_named(scenes, tmp_path):
+    rows = tmp_path / "rows.csv"
+    command = f"bench pairs {scenes} --matchers dynamic_programming --model small -o {rows}"
+    assert main(command.split()) == 0
+    with rows.open() as file:
+        found = {row["matcher"] for row in csv.DictReader(file)}
+    assert found == {*OPENCV_MATCHERS, "dynamic_programming", "small", "small refined"}
+
+
+def test_an_unknown_matcher_is_reported_in_one_line_before_anything_is_measured(scenes, capfd, monkeypatch):
+    monkeypatch.chdir(scenes)
+    assert main(f"bench pairs {scenes} --matchers words".split()) == 2
+    printed, told = capfd.readouterr()
+    assert printed == ""
+    assert told.strip().splitlines() == [
+        "Error: --matchers: expected adaptive_window, dynamic_programming, 3dmst, found 'words'"
+    ]
+    assert not Path("pairs.csv").exists()

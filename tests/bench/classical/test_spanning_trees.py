@@ -1,0 +1,116 @@
+import numpy as np
+import pytest
+from plain_labels import plain_fronts, plain_search
+from plain_medians import plain_medians
+
+from stereoweave.bench.classical import label_kernels as kernels
+from stereoweave.bench.classical.costs import see_from_right
+from stereoweave.bench.classical.median_kernels import weigh_medians
+from stereoweave.bench.classical.spanning_trees import find_planes, match_spanning_trees
+from stereoweave.bench.classical.trees import Forest
+from stereoweave.stereo import StereoPair
+
+
+@pytest.fixture
+def forest(rng):
+    """Return random trees over 6x8 pixels, of 20, 1 and 27 places."""
+    starts = np.array([0, 20, 21, 48])
+    parents = np.full(48, -1, np.int32)
+    for start, end in zip(starts[:-1], starts[1:], strict=True):
+        for i in range(start + 1, end):
+            parents[i] = rng.integers(start, i)
+    similarity = np.where(parents < 0, 0, rng.uniform(0.2, 1, 48)).astype(np.float32)
+    return Forest(rng.permutation(48).astype(np.int32), parents, similarity, starts)
+
+
+@pytest.fixture
+def costs(rng):
+    return rng.integers(0, 109, (48, 12), dtype=np.uint8)
+
+
+def label_whole(costs, forest):
+    labels, least = np.empty((len(costs), 3), np.float32), np.empty(len(costs), np.float32)
+    kernels.label_fronts(costs, *forest[1:], labels, least)
+    return labels, least
+
+
+def test_the_fast_whole_disparities_equal_the_plain_ones(forest, costs):
+    labels, least = label_whole(costs, forest)
+    expected, expected_least = plain_fronts(costs, *forest[1:])
+    np.testing.assert_array_equal(labels[:, 2], expected)
+    np.testing.assert_allclose(least, expected_least, rtol=1e-5)
+
+
+def test_the_fast_search_equals_the_plain_one(forest, costs, rng):
+    labels, least = label_whole(costs, forest)
+    plain_labels, plain_least = labels.astype(float), least.astype(float)
+    before = least.copy()
+    places = np.stack(np.divmod(forest.order, 8), 1).astype(np.float32)
+    at_pixel = np.argsort(forest.order).reshape(6, 8)
+    draws = rng.random((3, 19, kernels.DRAWS))
+    kernels.search_labels(costs, places, at_pixel, *forest[1:], draws, labels, least)
+    plain_search(costs, places, at_pixel, forest, draws, plain_labels, plain_least)
+    assert (least < before - 1).any()
+    np.testing.assert_allclose(least, plain_least, rtol=1e-4)
+    np.testing.assert_allclose(labels, plain_labels, atol=1e-3)
+
+
+def test_the_fast_medians_equal_the_plain_ones(rng):
+    image = rng.integers(0, 40, (24, 45, 3), dtype=np.uint8)
+    disparity_px = rng.uniform(0, 30, (24, 45)).astype(np.float32)
+    filled = rng.random((24, 45)) < 0.1
+    found_px = disparity_px.copy()
+    weights = np.exp(-np.arange(766) / 10).astype(np.float32)
+    weigh_medians(image, disparity_px, filled, weights, found_px)
+    np.testing.assert_array_equal(found_px, plain_medians(image, disparity_px, filled))
+
+
+def test_the_right_view_s_costs_are_those_of_the_left_pixels_that_match():
+    costs = np.arange(12, dtype=np.uint8).reshape(1, 4, 3)
+    assert see_from_right(costs).tolist() == [[[0, 4, 8], [3, 7, 11], [6, 10, 255], [9, 255, 255]]]
+
+
+def slanted(rng, a, b, c):
+    """Return a pair of noise, and the disparity a * x + b * y + c of its left view."""
+    rows, columns = np.indices((60, 100))
+    disparity_px = a * columns + b * rows + c
+    right = rng.integers(0, 256, (60, 100, 3)).astype(np.float32)
+    left = np.empty_like(right)
+    for y, channel in np.ndindex(60, 3):
+        left[y, :, channel] = np.interp(columns[y] - disparity_px[y], np.arange(100), right[y, :, channel])
+    return StereoPair(left=left.astype(np.uint8), right=right.astype(np.uint8)), disparity_px
+
+
+def test_3dmst_finds_the_plane_of_a_slanted_surface(rng):
+    pair, disparity_px = slanted(rng, 0.15, 0.08, 4.0)
+    found_px = match_spanning_trees(pair)
+    error_px = abs(found_px - disparity_px)[5:-5, 25:-5]
+    assert np.median(error_px) < 0.15
+    assert (error_px < 0.5).mean() > 0.95
+
+
+def test_3dmst_fills_what_the_right_camera_does_not_see_with_the_farther_surface(rng):
+    right = rng.integers(0, 256, (60, 120, 3), dtype=np.uint8)
+    left = rng.integers(0, 256, (60, 120, 3), dtype=np.uint8)
+    left[:, 4:] = right[:, :-4]
+    left[:, 60:90] = right[:, 40:70]  # at 20 px, before a wall at 4 px, of which it covers columns 44 to 59
+    found_px = match_spanning_trees(StereoPair(left=left, right=right))
+    assert abs(found_px[10:-10, 12:40] - 4).max() < 1
+    assert abs(found_px[10:-10, 64:86] - 20).max() < 1
+    assert (abs(found_px[10:-10, 46:58] - 4) < 1).mean() > 0.9
+
+
+def test_other_matching_costs_take_the_place_of_census_and_colour():
+    image = np.full((24, 32, 3), 90, np.uint8)
+    costs = np.full((24, 32, 10), 50, np.uint8)
+    costs[..., 6] = 0
+    found_px = match_spanning_trees(StereoPair(left=image, right=image), lambda _: costs)
+    np.testing.assert_allclose(found_px, 6)
+
+
+def test_the_same_seed_gives_the_same_planes(rng):
+    image = rng.integers(0, 256, (20, 30, 3), dtype=np.uint8)
+    costs = rng.integers(0, 100, (20, 30, 16), dtype=np.uint8)
+    one, again, other = (find_planes(image, costs, np.random.default_rng(seed)) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one, again)
+    assert (one != other).any()
