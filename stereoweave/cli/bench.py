@@ -68,6 +68,15 @@ Models = Annotated[
     list[str] | None,
     typer.Option(help="Network, as for stereoweave depth. Repeatable (default: all shipped networks)."),
 ]
+McCnn = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--mc-cnn",
+        metavar="FILE",
+        help="Additional matcher MC-CNN with the weights of this PyTorch file: published ones, or a "
+        "checkpoint. Repeatable. Needs the extra 'train'.",
+    ),
+]
 
 bench = Commands("Score matchers, new views, videos and trained networks.")
 
@@ -78,6 +87,7 @@ def pairs(  # noqa: PLR0913 - each is an option of the command line
     folder: ScenesFolder,
     out: CsvFile = Path("pairs.csv"),
     model: Models = None,
+    mc_cnn: McCnn = None,
     dataset: Dataset = None,
     plot: Plot = None,
     sparsification: SparsificationPlot = None,
@@ -106,7 +116,7 @@ def pairs(  # noqa: PLR0913 - each is an option of the command line
     engine = make_engine(cluster, cpus_each=threads or 1)
     threads = engine.threads_each if engine else threads
     cv2.setNumThreads(thread_count(threads))
-    makers = _list_makers(model, threads, provider)
+    makers = _list_makers(model, threads, provider) | _list_mc_cnns(mc_cnn or [], threads)
     scores = score_pairs(makers, partial(list_scenes, folder.absolute(), dataset), engine)
     rows = add_memory(scores.rows, makers, scores.largest)
     write_csv(out, rows, scores.machine)
@@ -289,6 +299,15 @@ def _list_makers(
         if name not in MODES:  # modes choose refinement themselves
             makers[name + REFINED] = partial(make_matcher, model, threads, refined=True, provider=provider)
     return makers
+
+
+def _list_mc_cnns(files: Sequence[Path], threads: int | None) -> dict[str, Callable[[], Any]]:
+    """Return factories of MC-CNN with each file's weights, with all sets of steps after the network."""
+    if not files:
+        return {}
+    with require_train_extra():
+        from stereoweave.learn.mc_cnn_matcher import list_mc_cnns
+    return list_mc_cnns(files, threads)
 
 
 def _check_plots(*pictures: Path | None) -> None:

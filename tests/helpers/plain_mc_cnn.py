@@ -1,4 +1,4 @@
-"""Plain NumPy reference of `stereoweave/bench/mc_cnn`: the paper's equations, one pixel or candidate at a time.
+"""Plain NumPy reference of `stereoweave/bench/mc_cnn`: one pixel or candidate at a time.
 
 Candidates outside the right view have a cost of infinity.
 """

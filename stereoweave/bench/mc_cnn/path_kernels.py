@@ -101,6 +101,4 @@ def along_columns(costs, strong, others_strong, small, large, totals):
                 edge = y + upwards
                 others = others_strong[edge, width - 1 - x : width - 1 - x + inside]
                 before = paths[(i - 1) % 2, x]
-                least[x] = _advance(
-                    before, least[x], here, strong[edge, x], others, small, large, after, out
-                )
+                least[x] = _advance(before, least[x], here, strong[edge, x], others, small, large, after, out)

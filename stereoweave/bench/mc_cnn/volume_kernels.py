@@ -1,8 +1,8 @@
 """Numba kernels that fill a volume of matching costs, and choose from it.
 
-The plain reference implementation is tests/helpers/plain_mc_cnn.py. A volume is float32 [H, W, D]. Candidate d
-of column x is column x - d of the right view; where that lies outside, the cost is OUTSIDE. All kernels
-process a left view; the right view is processed as the left view of the mirrored pair.
+The plain reference implementation is tests/helpers/plain_mc_cnn.py. A volume is float32 [H, W, D].
+Candidate d of column x is column x - d of the right view; where that lies outside, the cost is OUTSIDE. All
+kernels process a left view; the right view is processed as the left view of the mirrored pair.
 """
 
 import typing
@@ -12,7 +12,7 @@ import numpy as np
 from stereoweave.system.jit import kernel
 
 OUTSIDE = np.float32(1000)
-"""Cost of a candidate outside the right view. Above every other cost, and finite: kernels know no infinity."""
+"""Cost of a candidate outside the right view: above every other cost, and finite, as kernels need it."""
 
 
 @kernel

@@ -1,10 +1,10 @@
-"""MC-CNN, fast architecture: J. Zbontar and Y. LeCun, "Stereo Matching by Training a Convolutional Neural
-Network to Compare Image Patches", JMLR 2016, section 3.1.
+"""MC-CNN, the fast architecture of J. Zbontar and Y. LeCun (JMLR 2016).
 
-One stack of convolutions turns each 11x11 patch into a vector of unit length; two patches are as similar as
-the dot product of their vectors. `bench/mc_cnn` finds disparities from these vectors. The parameters have
-the names of the published PyTorch weights (github.com/CNES/Pandora_MCCNN, Apache-2.0), which `load_weights`
-reads.
+The paper is "Stereo Matching by Training a Convolutional Neural Network to Compare Image Patches"; its
+section 3.1 has the network. One stack of convolutions turns each 11x11 patch into a vector of unit length;
+two patches are as similar as the dot product of their vectors. `bench/mc_cnn` finds disparities from them. The
+parameters have the names of the published PyTorch weights (github.com/CNES/Pandora_MCCNN, Apache-2.0), which
+`load_weights` reads.
 """
 
 from pathlib import Path
@@ -68,8 +68,8 @@ class MCCNN(nn.Module):
 def standardise(view: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 1 h w"]:
     """Return grey levels (Rec. 601) with mean 0 and standard deviation 1 in each view; 0 in a plain view.
 
-    Grey is rounded to whole levels of 0..255, as OpenCV does. The published weights were trained on such
-    levels: without rounding, 1 % fewer pixels are wrong.
+    Grey is rounded to whole levels of 0..255, as OpenCV does: what is known of the published weights was
+    measured on such levels.
     """
     red, green, blue = view.float().chunk(3, 1)
     levels = (255 * (0.299 * red + 0.587 * green + 0.114 * blue)).round()

@@ -1,4 +1,4 @@
-"""The steps of MC-CNN's stereo method: worked examples, and the fast kernels against their plain references."""
+"""The steps of MC-CNN's stereo method: worked examples, and fast kernels against plain references."""
 
 from dataclasses import replace
 

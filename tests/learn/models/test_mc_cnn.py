@@ -1,6 +1,5 @@
 """MC-CNN: its costs, its views and patches, and the known results of the published weights."""
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -34,11 +33,13 @@ def test_the_network_takes_45_giga_multiply_adds_for_a_view():
     assert "45.48 G multiply-adds" in MCCNN.__doc__
 
 
-def test_a_view_has_mean_0_and_deviation_1_over_the_levels_that_opencv_gives(rng):
-    view = rng.integers(0, 256, (30, 40, 3), np.uint8)
-    levels = cv2.cvtColor(view, cv2.COLOR_RGB2GRAY).astype(float)
-    found = standardise(torch.from_numpy(view).permute(2, 0, 1)[None] / 255)[0, 0].numpy()
-    np.testing.assert_allclose(found, (levels - levels.mean()) / levels.std(), atol=1e-5)
+def test_a_view_has_mean_0_and_deviation_1_over_whole_levels():
+    # Red, green, blue, white and black have the levels 76.2, 149.7, 29.1, 255 and 0, with a mean of 102.
+    view = torch.tensor([[1.0, 0, 0, 1, 0], [0, 1, 0, 1, 0], [0, 0, 1, 1, 0]])[None, :, None]
+    deviations = np.array([76, 150, 29, 255, 0]) - 102
+    assert (deviations**2).sum() == 42_122
+    found = standardise(view)[0, 0, 0].numpy()
+    np.testing.assert_allclose(found, deviations / (42_122 / 5) ** 0.5, rtol=1e-5)
 
 
 def test_a_plain_view_is_0_everywhere():
@@ -71,8 +72,14 @@ def test_the_weights_of_a_published_file_and_of_a_checkpoint_are_loaded(tmp_path
         ({"conv_blocks.8.bias": None}, "found no conv_blocks.8.bias"),
         ({"conv_blocks.0.weight": torch.zeros(64, 3, 3, 3)}, r"\(64, 1, 3, 3\), found \(64, 3, 3, 3\)"),
         ({"conv_blocks.2.bias": [0.0] * 64}, r"conv_blocks.2.bias of shape \(64,\), found list"),
-        ({"conv_blocks.4.bias": torch.full((64,), torch.nan)}, "expected finite numbers in conv_blocks.4.bias"),
-        ({"conv_blocks.4.bias": torch.zeros(64, dtype=torch.int8)}, "expected finite numbers in conv_blocks.4"),
+        (
+            {"conv_blocks.4.bias": torch.full((64,), torch.nan)},
+            "expected finite numbers in conv_blocks.4.bias",
+        ),
+        (
+            {"conv_blocks.4.bias": torch.zeros(64, dtype=torch.int8)},
+            "expected finite numbers in conv_blocks.4",
+        ),
         ({"head.weight": torch.zeros(1)}, "also found head.weight"),
         ({7: torch.zeros(1)}, "also found 7"),
     ],

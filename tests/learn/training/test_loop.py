@@ -329,7 +329,7 @@ def test_every_shipped_recipe_takes_its_first_steps(recipe, tmp_path, logger):
     assert_all_moved(*step_of(recipe, tmp_path, logger, steps))
 
 
-@pytest.mark.parametrize("model", [name for name in MODELS if not name.startswith("weave")])
+@pytest.mark.parametrize("model", [name for name in MODELS if not name.startswith(("weave", "mc_cnn"))])
 def test_each_of_the_papers_networks_trains_if_only_the_model_is_changed(model, tmp_path, logger):
     """The loss is all of equation (5) on depth with an exponent, on one batch for all networks."""
     recipe = recipe_of("fast_depth", target="depth", exponent=1.5, alpha_p=1.0, averaged_steps=1)
