@@ -73,8 +73,8 @@ McCnn = Annotated[
     typer.Option(
         "--mc-cnn",
         metavar="FILE",
-        help="Additional matcher MC-CNN with the weights of this PyTorch file: published ones, or a "
-        "checkpoint. Repeatable. Needs the extra 'train'.",
+        help="MC-CNN with the weights of this PyTorch file, published ones or a checkpoint's. Repeatable. "
+        "With it, networks are scored only if --model names them. Needs the extra 'train'.",
     ),
 ]
 
@@ -116,7 +116,9 @@ def pairs(  # noqa: PLR0913 - each is an option of the command line
     engine = make_engine(cluster, cpus_each=threads or 1)
     threads = engine.threads_each if engine else threads
     cv2.setNumThreads(thread_count(threads))
-    makers = _list_makers(model, threads, provider) | _list_mc_cnns(mc_cnn or [], threads)
+    makers = _list_mc_cnns(mc_cnn or [], threads)
+    if model or not makers:
+        makers |= _list_makers(model, threads, provider)
     scores = score_pairs(makers, partial(list_scenes, folder.absolute(), dataset), engine)
     rows = add_memory(scores.rows, makers, scores.largest)
     write_csv(out, rows, scores.machine)
@@ -302,7 +304,7 @@ def _list_makers(
 
 
 def _list_mc_cnns(files: Sequence[Path], threads: int | None) -> dict[str, Callable[[], Any]]:
-    """Return factories of MC-CNN with each file's weights, with all sets of steps after the network."""
+    """Return factories of MC-CNN with the weights of each file."""
     if not files:
         return {}
     with require_train_extra():

@@ -2,9 +2,9 @@
 
 The paper is "Stereo Matching by Training a Convolutional Neural Network to Compare Image Patches"; its
 section 3.1 has the network. One stack of convolutions turns each 11x11 patch into a vector of unit length;
-two patches are as similar as the dot product of their vectors. `bench/mc_cnn` finds disparities from them. The
-parameters have the names of the published PyTorch weights (github.com/CNES/Pandora_MCCNN, Apache-2.0), which
-`load_weights` reads.
+two patches are as similar as the dot product of their vectors. `bench/mc_cnn` finds disparities from them.
+The parameters have the names of the published PyTorch weights (github.com/CNES/Pandora_MCCNN, Apache-2.0),
+which `load_weights` reads.
 """
 
 from pathlib import Path

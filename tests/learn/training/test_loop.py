@@ -339,11 +339,12 @@ def test_each_of_the_papers_networks_trains_if_only_the_model_is_changed(model, 
     assert_same(dict(run.averaged.module.state_dict()), dict(run.network.state_dict()))
 
 
-def test_a_resumed_code_network_ends_as_an_uninterrupted_one(folder, in_place):
-    """This includes dropout, whose random draws continue."""
-    recipe = recipe_of("fast_depth", name="paper", steps=4, alpha_p=1.0)
-    whole = checkpoint.load(training.train_recipe(recipe, folder / "paper", QUIET))
-    last = folder / "paper_resumed" / "last.pt"
+@pytest.mark.parametrize("model", ["fast_depth", "mc_cnn"])
+def test_another_network_ends_as_an_uninterrupted_one_if_it_is_resumed(folder, in_place, model):
+    """This includes dropout and the choice of patches, whose random draws continue."""
+    recipe = recipe_of(model, name="paper", steps=4, alpha_p=1.0)
+    whole = checkpoint.load(training.train_recipe(recipe, folder / model, QUIET))
+    last = folder / f"{model}_resumed" / "last.pt"
 
     class Killed(Exception):
         pass
