@@ -75,6 +75,15 @@ MatcherNames = Annotated[
         "Repeatable. With it, networks are scored only if --model names them."
     ),
 ]
+McCnn = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--mc-cnn",
+        metavar="FILE",
+        help="MC-CNN with the weights of this PyTorch file, published ones or a checkpoint's. Repeatable. "
+        "With it, networks are scored only if --model names them. Needs the extra 'train'.",
+    ),
+]
 
 bench = Commands("Score matchers, new views, videos and trained networks.")
 
@@ -86,6 +95,7 @@ def pairs(  # noqa: PLR0913 - each is an option of the command line
     out: CsvFile = Path("pairs.csv"),
     model: Models = None,
     matchers: MatcherNames = None,
+    mc_cnn: McCnn = None,
     dataset: Dataset = None,
     plot: Plot = None,
     sparsification: SparsificationPlot = None,
@@ -116,7 +126,8 @@ def pairs(  # noqa: PLR0913 - each is an option of the command line
     threads = engine.threads_each if engine else threads
     cv2.setNumThreads(thread_count(threads))
     makers = {name: partial(make_classical_matcher, name) for name in matchers or ()}
-    if model or not matchers:
+    makers |= _list_mc_cnns(mc_cnn or [], threads)
+    if model or not makers:
         makers |= _list_makers(model, threads, provider)
     scores = score_pairs(makers, partial(list_scenes, folder.absolute(), dataset), engine)
     rows = add_memory(scores.rows, makers, scores.largest)
@@ -300,6 +311,15 @@ def _list_makers(
         if name not in MODES:  # modes choose refinement themselves
             makers[name + REFINED] = partial(make_matcher, model, threads, refined=True, provider=provider)
     return makers
+
+
+def _list_mc_cnns(files: Sequence[Path], threads: int | None) -> dict[str, Callable[[], Any]]:
+    """Return factories of MC-CNN with the weights of each file."""
+    if not files:
+        return {}
+    with require_train_extra():
+        from stereoweave.learn.mc_cnn_matcher import list_mc_cnns
+    return list_mc_cnns(files, threads)
 
 
 def _check_plots(*pictures: Path | None) -> None:

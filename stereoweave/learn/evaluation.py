@@ -1,6 +1,7 @@
 """Scores of trained networks on their held-out pairs, for `stereoweave bench networks`."""
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,9 @@ from stereoweave.learn import checkpoint
 from stereoweave.learn.checkpoint import Checkpoint
 from stereoweave.learn.data.batches import collate, read_known
 from stereoweave.learn.data.sources import PairSource, cache_pairs, open_sources
+from stereoweave.learn.mc_cnn_matcher import match_sample
 from stereoweave.learn.models import CodeNetwork, build_network
+from stereoweave.learn.models.mc_cnn import MCCNN
 from stereoweave.learn.recipe import Recipe
 from stereoweave.learn.training.objective import CodeObjective
 from stereoweave.stereo import Sample
@@ -57,6 +60,8 @@ def make_method(trained: Checkpoint) -> DisparityMethod:
     network = build_network(trained.recipe)
     network.load_state_dict(trained.averaged)
     network.eval()
+    if isinstance(network, MCCNN):
+        return partial(match_sample, network, int(trained.recipe.max_disparity_px))
 
     def match(sample: Sample) -> Float[np.ndarray, "h w"]:
         batch = collate([sample])

@@ -90,7 +90,8 @@ class Recipe:
         validation_pairs: Number of pairs to validate on: collages with another seed, or held-out frames.
         held_out: Further validation sets, each with its name and its folder of rendered pairs.
         validate_every: Steps between validations; each validation is followed by a checkpoint.
-        loss: Key of LOSSES: "weave" for WeaveNet; for all other networks, a loss that compares codes.
+        loss: Key of LOSSES: "weave" for WeaveNet, "hinge" for MC-CNN; for all other networks, a loss that
+            compares codes.
         target: Quantity that a code encodes, "disparity" or "depth".
         max_disparity_px: Disparity of code 1; larger true disparities count as unknown.
         max_depth_m: Depth of code 0; a larger true depth is an error.

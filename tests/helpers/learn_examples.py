@@ -45,7 +45,7 @@ def recipe_of(model, **changes):
 
     With 32 candidates a volume would be 2 levels deep, for which oneDNN's bfloat16 gradient is wrong.
     """
-    loss = "weave" if model.startswith("weave") else "l2"
+    loss = {"weave": "weave", "mc": "hinge"}.get(model.split("_")[0], "l2")
     return replace(RECIPE, **{"model": model, "loss": loss, "max_disparity_px": 48.0, **changes})
 
 

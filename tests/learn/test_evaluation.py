@@ -16,6 +16,7 @@ from learn_examples import (
 )
 from rich.console import Console
 
+from stereoweave.bench.mc_cnn.steps import FAST, find_disparity
 from stereoweave.bench.metrics import epe_px
 from stereoweave.bench.projected_views import measure_projection, score_projections
 from stereoweave.bench.projection import project_right
@@ -24,6 +25,7 @@ from stereoweave.learn.data.batches import collate
 from stereoweave.learn.data.pair_cache import CachedPairs
 from stereoweave.learn.data.sources import VALIDATION_SEED
 from stereoweave.learn.evaluation import evaluate, make_median_method, make_method
+from stereoweave.learn.mc_cnn_matcher import describe
 from stereoweave.learn.models import build_network
 
 QUIET = Console(quiet=True)
@@ -50,6 +52,7 @@ KEPT = {
     "straight": kept_of(replace(PAPER, exponent=1.0), answer_half),
     "random": kept_of(PAPER),
     "psmnet": kept_of(recipe_of("psmnet")),
+    "mc_cnn": kept_of(recipe_of("mc_cnn")),
     "weave_small": kept_of(RECIPE),
 }
 
@@ -104,6 +107,9 @@ def disparity_px(name, sample):
     network = build_network(KEPT[name].recipe)
     network.load_state_dict(KEPT[name].averaged)
     batch = collate([sample])
+    if name == "mc_cnn":
+        left, right = (describe(network, view) for view in (sample.left, sample.right))
+        return find_disparity(left, right, 48, FAST)
     output = network.eval()(batch["left"], batch["right"])
     match name:
         case "weave_small":
@@ -113,7 +119,7 @@ def disparity_px(name, sample):
     return 32 * np.sqrt(output[0, 0].numpy())
 
 
-@pytest.mark.parametrize("name", ["random", "psmnet", "weave_small"])
+@pytest.mark.parametrize("name", ["random", "psmnet", "mc_cnn", "weave_small"])
 def test_a_row_has_the_means_over_the_held_out_pairs(folder, rows, name):
     held_out = CachedPairs(folder / "pairs", VALIDATION_SEED, PAPER.validation_pairs, PAIR_SIZE)
     samples = [held_out[index] for index in range(held_out.count)]

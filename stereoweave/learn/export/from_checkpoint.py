@@ -20,6 +20,7 @@ from stereoweave.learn import checkpoint
 from stereoweave.learn.checkpoint import Checkpoint
 from stereoweave.learn.export import confidence as calibrate
 from stereoweave.learn.models import CodeNetwork, build_network
+from stereoweave.learn.models.mc_cnn import MCCNN
 from stereoweave.learn.models.psmnet import PSMNet
 from stereoweave.learn.models.weave import WeaveNet
 from stereoweave.learn.recipe import Recipe
@@ -91,11 +92,16 @@ def load_matcher_network(kept: Checkpoint) -> Any:
     """Load a checkpoint's averaged network for matching.
 
     Raises:
-        StereoweaveError: The network estimates depth, or is a PSMNet.
+        StereoweaveError: The network estimates depth, or is a PSMNet or an MC-CNN.
     """
     network = build_network(kept.recipe)
     network.load_state_dict(kept.averaged)
     network.eval()
+    if isinstance(network, MCCNN):
+        raise StereoweaveError(
+            f"{kept.recipe.name}: expected a network that estimates disparities, found mc_cnn, which "
+            "compares patches; score it with `stereoweave bench networks`"
+        )
     if not isinstance(network, CodeNetwork):
         return network
     if kept.recipe.target != "disparity":

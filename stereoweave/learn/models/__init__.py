@@ -10,6 +10,7 @@ from stereoweave.errors import FormatError
 from stereoweave.learn.models.densemapnet import DenseMapNet
 from stereoweave.learn.models.dispnet import DispNet
 from stereoweave.learn.models.fast_depth import FastDepthNet
+from stereoweave.learn.models.mc_cnn import MCCNN
 from stereoweave.learn.models.psmnet import PSMNet
 from stereoweave.learn.models.weave import BASE, BASE_GROWN, SMALL, WeaveNet
 from stereoweave.learn.recipe import Recipe
@@ -23,6 +24,7 @@ MODELS: dict[str, Callable[..., Any]] = {
     "densemapnet": DenseMapNet,
     "dispnet": DispNet,
     "psmnet": PSMNet,
+    "mc_cnn": MCCNN,
 }
 
 

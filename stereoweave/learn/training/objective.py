@@ -1,4 +1,4 @@
-"""Training objectives: one for WeaveNet, and the paper's for all other networks."""
+"""Training objectives: one for WeaveNet, one for MC-CNN, and the paper's for all other networks."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -17,6 +17,7 @@ from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.learn.data.batches import collate, read_known
 from stereoweave.learn.data.sources import PairSource
 from stereoweave.learn.models import CodeNetwork
+from stereoweave.learn.models.mc_cnn import MCCNN
 from stereoweave.learn.models.weave import WeaveNet, WeaveStages
 from stereoweave.learn.recipe import Recipe
 from stereoweave.learn.training.losses import (
@@ -26,6 +27,7 @@ from stereoweave.learn.training.losses import (
     smooth_l1_loss,
     weave_losses,
 )
+from stereoweave.learn.training.patches import PatchObjective
 from stereoweave.learn.training.perceptual import PerceptualLoss
 from stereoweave.learn.training.scores import validate
 from stereoweave.learn.training.warp import depth_to_disparity
@@ -35,7 +37,8 @@ Batch = dict[str, Tensor]
 Map = Float[Tensor, "b 1 h w"]
 
 WEAVE, SMOOTH_L1, CROSS_ENTROPY, PERCEPTUAL = "weave", "smooth_l1", "cross_entropy", "perceptual"
-LOSSES = (WEAVE, *CODE_LOSSES, PERCEPTUAL)
+HINGE = "hinge"
+LOSSES = (WEAVE, *CODE_LOSSES, PERCEPTUAL, HINGE)
 # Numbers of training pairs and of bins in the ground-truth histogram to which an exponent is fitted.
 _FITTED_PAIRS, _FITTED_BINS = 200, 256
 
@@ -61,11 +64,13 @@ def build_objective(recipe: Recipe, network: nn.Module) -> Objective:
     """Build a recipe's objective. Raises FormatError if the loss is unknown or does not fit the network."""
     if recipe.loss not in LOSSES:
         raise FormatError(f"{recipe.name}: loss: expected one of {', '.join(LOSSES)}, found {recipe.loss!r}")
-    if isinstance(network, WeaveNet) != (recipe.loss == WEAVE):
-        fitting = WEAVE if isinstance(network, WeaveNet) else " or ".join(LOSSES[1:])
+    if recipe.loss not in (fitting := _list_fitting(network)):
         raise FormatError(
-            f"{recipe.name}: loss: expected {fitting} for model = {recipe.model!r}, found {recipe.loss!r}"
+            f"{recipe.name}: loss: expected {' or '.join(fitting)} for model = {recipe.model!r}, "
+            f"found {recipe.loss!r}"
         )
+    if isinstance(network, MCCNN):
+        return PatchObjective(recipe)
     if not isinstance(network, CodeNetwork):
         return WeaveObjective(recipe)
     if recipe.loss == CROSS_ENTROPY and network.predicts != "code":
@@ -74,6 +79,13 @@ def build_objective(recipe: Recipe, network: nn.Module) -> Objective:
             f"model = {recipe.model!r}, whose disparities may be out of range; choose another loss"
         )
     return CodeObjective(recipe, network)
+
+
+def _list_fitting(network: nn.Module) -> tuple[str, ...]:
+    """List the losses that can train a network."""
+    if isinstance(network, WeaveNet):
+        return (WEAVE,)
+    return (HINGE,) if isinstance(network, MCCNN) else (*CODE_LOSSES, PERCEPTUAL)
 
 
 class WeaveObjective:

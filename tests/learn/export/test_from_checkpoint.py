@@ -164,6 +164,15 @@ def test_a_network_that_estimates_depth_cannot_be_exported(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+def test_a_network_that_compares_patches_cannot_be_exported(tmp_path):
+    checkpoint.save(checkpoint_of(untrained("mc_cnn"), recipe_of("mc_cnn")), tmp_path / "last.pt")
+    assert complaint(export.export_matcher, tmp_path, tmp_path / "out" / "mc_cnn.onnx") == (
+        "tiny: expected a network that estimates disparities, found mc_cnn, which compares patches; "
+        "score it with `stereoweave bench networks`"
+    )
+    assert not (tmp_path / "out").exists()
+
+
 class OneLayer(nn.Module):
     def __init__(self):
         super().__init__()

@@ -22,8 +22,9 @@ PARAMETERS = {
     "densemapnet": 290_290,
     "dispnet": 42_174_022,
     "psmnet": 5_224_768,
+    "mc_cnn": 148_352,
 }
-CODE_NETWORKS = [name for name in MODELS if not name.startswith("weave")]
+CODE_NETWORKS = [name for name in MODELS if not name.startswith(("weave", "mc_cnn"))]
 # Loss, learning rate and steps with which each network overfits one pair.
 LEARNS = {
     "fast_depth": ("l2", 2e-3, 20),
@@ -150,5 +151,5 @@ def test_the_error_for_an_unknown_network_lists_the_known_ones():
         build_network(recipe_of("spider"))
     assert str(caught.value) == (
         "tiny: model = 'spider', expected one of weave_small, weave_base, weave_base_grown, fast_depth, "
-        "fast_depth_without_skips, densemapnet, dispnet, psmnet"
+        "fast_depth_without_skips, densemapnet, dispnet, psmnet, mc_cnn"
     )

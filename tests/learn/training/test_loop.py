@@ -329,7 +329,7 @@ def test_every_shipped_recipe_takes_its_first_steps(recipe, tmp_path, logger):
     assert_all_moved(*step_of(recipe, tmp_path, logger, steps))
 
 
-@pytest.mark.parametrize("model", [name for name in MODELS if not name.startswith("weave")])
+@pytest.mark.parametrize("model", [name for name in MODELS if not name.startswith(("weave", "mc_cnn"))])
 def test_each_of_the_papers_networks_trains_if_only_the_model_is_changed(model, tmp_path, logger):
     """The loss is all of equation (5) on depth with an exponent, on one batch for all networks."""
     recipe = recipe_of("fast_depth", target="depth", exponent=1.5, alpha_p=1.0, averaged_steps=1)
@@ -339,11 +339,12 @@ def test_each_of_the_papers_networks_trains_if_only_the_model_is_changed(model, 
     assert_same(dict(run.averaged.module.state_dict()), dict(run.network.state_dict()))
 
 
-def test_a_resumed_code_network_ends_as_an_uninterrupted_one(folder, in_place):
-    """This includes dropout, whose random draws continue."""
-    recipe = recipe_of("fast_depth", name="paper", steps=4, alpha_p=1.0)
-    whole = checkpoint.load(training.train_recipe(recipe, folder / "paper", QUIET))
-    last = folder / "paper_resumed" / "last.pt"
+@pytest.mark.parametrize("model", ["fast_depth", "mc_cnn"])
+def test_another_network_ends_as_an_uninterrupted_one_if_it_is_resumed(folder, in_place, model):
+    """This includes dropout and the choice of patches, whose random draws continue."""
+    recipe = recipe_of(model, name="paper", steps=4, alpha_p=1.0)
+    whole = checkpoint.load(training.train_recipe(recipe, folder / model, QUIET))
+    last = folder / f"{model}_resumed" / "last.pt"
 
     class Killed(Exception):
         pass

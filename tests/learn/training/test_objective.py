@@ -225,14 +225,16 @@ def test_each_network_has_its_objective():
 
 
 def test_a_loss_that_is_unknown_or_another_network_s_is_refused():
-    assert LOSSES == ("weave", "l2", "l1", "smooth_l1", "cross_entropy", "perceptual")
+    assert LOSSES == ("weave", "l2", "l1", "smooth_l1", "cross_entropy", "perceptual", "hinge")
     paper, known = Constant("code", 0.5), "l2 or l1 or smooth_l1 or cross_entropy or perceptual"
     with torch.device("meta"):
-        weave = build_network(RECIPE)
+        weave, patches = build_network(RECIPE), build_network(recipe_of("mc_cnn"))
     for recipe, network, expected in (
         (replace(DISPARITY, loss="l3"), paper, f"one of {', '.join(LOSSES)}"),
         (replace(DISPARITY, loss="weave"), paper, f"{known} for model = 'fast_depth'"),
         (replace(RECIPE, loss="l2"), weave, "weave for model = 'weave_small'"),
+        (replace(DISPARITY, loss="hinge"), paper, f"{known} for model = 'fast_depth'"),
+        (recipe_of("mc_cnn", loss="l2"), patches, "hinge for model = 'mc_cnn'"),
     ):
         message = complaint(build_objective, recipe, network)
         assert message == f"tiny: loss: expected {expected}, found {recipe.loss!r}"
