@@ -76,6 +76,16 @@ TABLE_I = {
     "psmnet": ((3.85, 8.12, 3.88, 2.38), (7.94, 10.32, 7.36, 41.22)),
     "fast_depth": ((3.95, 6.42, 4.08, 2.32), (7.99, 8.24, 7.93, 37.31)),
 }
+# Networks in the paper's words.
+NAMES = {
+    "dispnet": "DispNet",
+    "densemapnet": "DenseMapNet",
+    "psmnet": "PSMNet",
+    "scvnet": "SCV-Net",
+    "ganet_11": "GA-Net-11",
+    "ganet_deep": "GA-Net-deep",
+    "fast_depth": "the paper's network",
+}
 # Index of the only column whose target is depth.
 _PROPELLER = 3
 _COLUMNS = {
@@ -136,9 +146,12 @@ def list_comparisons(depth: bool = False) -> Iterator[Comparison]:
 
 
 def _rival_changes(depth: bool) -> Iterator[tuple[str, str, str, str, tuple[_Measure, ...]]]:
-    """Yield Table I's claims about each rival, as rows of _CHANGES; with `depth`, only for Propeller."""
-    for rival in ("densemapnet", "dispnet", "psmnet"):
-        claim = NETWORKS_SHORT if rival == "psmnet" else NETWORKS
+    """Yield Table I's claims about each rival, as rows of _CHANGES; with `depth`, only for Propeller.
+
+    SCV-Net and GA-Net, which the paper describes without numbers, are compared without a claim.
+    """
+    for rival in ("densemapnet", "dispnet", "psmnet", "scvnet", "ganet_11"):
+        claim = NETWORKS if rival in ("densemapnet", "dispnet") else NETWORKS_SHORT
         measures = (
             _table_i_measure(rival, 0, "epe_px", "end-point error", depth),
             _table_i_measure(rival, 1, "mae_filled", "MAE of the right view", depth),
@@ -147,6 +160,8 @@ def _rival_changes(depth: bool) -> Iterator[tuple[str, str, str, str, tuple[_Mea
 
 
 def _table_i_measure(rival: str, column: int, measure: str, name: str, depth: bool) -> _Measure:
+    if rival not in TABLE_I:
+        return measure, name, "-", None
     numbers = zip(TABLE_I[rival][column], TABLE_I["fast_depth"][column], strict=True)
     less = [reduction_percent(*both) for both in numbers]
     where = "Table I"
@@ -207,10 +222,11 @@ def propeller_table(rows: Sequence[PaperRow]) -> str:
     found = [row for row in rows if row.claim in (NETWORKS, NETWORKS_SHORT)]
     for network, steps in sorted({(row.model, row.steps) for row in found}, key=_table_i_order):
         chosen = [row for row in found if (row.model, row.steps) == (network, steps)]
-        cells = [network, str(steps)]
-        for column, measure in zip(TABLE_I[network], ("epe_cm", "mae_filled"), strict=True):
-            paper, here = column[_PROPELLER], _mean(chosen, measure)
-            cells += [f"{paper:.2f}", f"{here:.2f}", _format_difference(here, paper, 2)]
+        cells = [NAMES[network], str(steps)]
+        for index, measure in enumerate(("epe_cm", "mae_filled")):
+            paper = TABLE_I[network][index][_PROPELLER] if network in TABLE_I else None
+            here = _mean(chosen, measure)
+            cells += [_format_or_dash(paper, ".2f"), f"{here:.2f}", _format_difference(here, paper, 2)]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
@@ -240,8 +256,8 @@ def run_time_table(rows: Iterable[Mapping[str, str]]) -> str:
     """Return a Markdown table of run times, beside the paper's, as multiples of DenseMapNet's.
 
     Args:
-        rows: Rows of the CSV file that `python -m experiments.speed` writes. The paper's column is empty
-            where the paper has no time.
+        rows: Rows of the CSV file that `python -m experiments.speed` writes. Networks that have no graph for
+            ONNX Runtime and those without a time in the paper have a dash instead.
     """
     columns = (
         "network",
@@ -256,18 +272,26 @@ def run_time_table(rows: Iterable[Mapping[str, str]]) -> str:
     )
     lines = [f"| {' | '.join(columns)} |", "|---" * len(columns) + "|"]
     for row in rows:
-        paper, onnx_relative = RUN_TIMES.get(row["network"]), float(row["onnx_relative"])
+        paper = RUN_TIMES.get(row["network"])
+        onnx_ms, onnx_relative = (
+            float(row[name]) if row[name] else None for name in ("onnx_ms", "onnx_relative")
+        )
         lines.append(
-            f"| {row['network']} | {row['parameters']} | {float(row['multiply_adds']) / 1e9:.1f} "
+            f"| {NAMES.get(row['network'], row['network'])} | {row['parameters']} "
+            f"| {float(row['multiply_adds']) / 1e9:.1f} "
             f"| {float(row['eager_ms']):.0f} | {float(row['eager_relative']):.2f} "
-            f"| {float(row['onnx_ms']):.0f} | {onnx_relative:.2f} "
-            f"| {'-' if paper is None else f'{paper:g}'} | {_format_difference(onnx_relative, paper, 2)} |"
+            f"| {_format_or_dash(onnx_ms, '.0f')} | {_format_or_dash(onnx_relative, '.2f')} "
+            f"| {_format_or_dash(paper, 'g')} | {_format_difference(onnx_relative, paper, 2)} |"
         )
     return "\n".join(lines)
 
 
-def _format_difference(here: float, paper: float | None, digits: int) -> str:
-    return "" if paper is None else f"{here - paper:+z.{digits}f}"
+def _format_or_dash(value: float | None, digits: str) -> str:
+    return "-" if value is None else f"{value:{digits}}"
+
+
+def _format_difference(here: float | None, paper: float | None, digits: int) -> str:
+    return "" if here is None or paper is None else f"{here - paper:+z.{digits}f}"
 
 
 def _judge(comparison: Comparison, mean: float, half: float) -> str:
@@ -286,8 +310,8 @@ def _judge(comparison: Comparison, mean: float, half: float) -> str:
 
 
 def _table_i_order(trained: tuple[str, int]) -> tuple[int, int]:
-    """Return a sort key: the order of Table I's rows, then the number of steps."""
-    return list(TABLE_I).index(trained[0]), trained[1]
+    """Return a sort key: the order of Table I's rows with those that it lacks, then the number of steps."""
+    return list(NAMES).index(trained[0]), trained[1]
 
 
 def _select(rows: Iterable[PaperRow], claim: str, setting: str) -> list[PaperRow]:

@@ -25,8 +25,11 @@ RIVAL_SETTINGS: dict[str, dict[str, Any]] = {
     "densemapnet": {"exponent": 1.0, "alpha_p": 0.0},
     "dispnet": {"exponent": 1.0, "alpha_p": 0.0, "loss": "l1", "learning_rate": 1e-4},
     "psmnet": {"exponent": 1.0, "alpha_p": 0.0, "loss": "smooth_l1"},
+    "scvnet": {"exponent": 1.0, "alpha_p": 0.0, "loss": "l1"},
+    "ganet_11": {"exponent": 1.0, "alpha_p": 0.0, "loss": "smooth_l1"},
 }
-# PSMNet takes 59 times the multiply-adds of the paper's network, so the two are compared after fewer steps.
+# PSMNet takes 59 times the multiply-adds of the paper's network, and SCV-Net and GA-Net are as slow, so they
+# are compared with it after fewer steps.
 SHORT = 4
 FIGURE_3_STEPS = (10, 50, 250)
 # The target set of the transfer: fewer and larger collages with larger disparities.
@@ -43,8 +46,8 @@ def list_trials(base: Recipe, seeds: int, fitted_exponent: float) -> list[Trial]
 
     Args:
         base: The paper's recipe for the data at hand.
-        seeds: Number of times that each setting is trained, except for DispNet, PSMNet, the transfer and the
-            iterations, which are trained once.
+        seeds: Number of times that each setting is trained, except for the networks after a quarter of the
+            steps, DispNet, the transfer and the iterations, which are trained once.
         fitted_exponent: The exponent p fitted to the histogram of the ground truth that the base trains on.
     """
     # Otherwise every training would replace its exponent p by the fitted one.

@@ -17,7 +17,11 @@ from stereoweave.learn.recipe import Recipe
 from stereoweave.system.threads import thread_count
 
 REFERENCE = "densemapnet"
-NETWORKS = ("fast_depth", REFERENCE, "dispnet", "psmnet")
+NETWORKS = ("fast_depth", REFERENCE, "dispnet", "psmnet", "scvnet", "ganet_11", "ganet_deep")
+# Networks that take seconds for a pair, and are timed a third as often.
+_SLOW = "psmnet", "scvnet", "ganet_11", "ganet_deep"
+# Networks without a graph: their recursions over rows and columns would be unrolled into 20,000 nodes.
+_RECURSIVE = "ganet_11", "ganet_deep"
 HEIGHT_PX, WIDTH_PX = 480, 640
 DISPARITIES = 192.0
 TURNS = 7
@@ -28,8 +32,10 @@ class SpeedRow:
     """Cost of a 640x480 pair for one network of the paper's comparison.
 
     Attributes:
-        eager_ms, onnx_ms: Median time in PyTorch and in ONNX Runtime, in float32, on all cores.
+        eager_ms, onnx_ms: Median time in PyTorch and in ONNX Runtime, in float32, on all cores. GA-Net, which
+            is not exported, has no time in ONNX Runtime.
         eager_relative, onnx_relative: The same times as multiples of DenseMapNet's.
+        multiply_adds: Of convolutions and matrix products; GA-Net's aggregations are neither.
     """
 
     network: str
@@ -37,8 +43,8 @@ class SpeedRow:
     multiply_adds: int
     eager_ms: float
     eager_relative: float
-    onnx_ms: float
-    onnx_relative: float
+    onnx_ms: float | None
+    onnx_relative: float | None
 
 
 def measure_run_times(
@@ -49,7 +55,7 @@ def measure_run_times(
     Args:
         recipe: Recipe of the networks, except that the target becomes disparity up to 192 px.
         networks: Names in MODELS, including DenseMapNet's.
-        turns: Number of repetitions; PSMNet, by far the slowest, is timed a third as often.
+        turns: Number of repetitions; the slow networks are timed a third as often.
     """
     torch.set_num_threads(thread_count(None))
     pair = torch.rand(2, 1, 3, HEIGHT_PX, WIDTH_PX)
@@ -59,25 +65,33 @@ def measure_run_times(
     }
     with tempfile.TemporaryDirectory() as folder:
         calls = {
-            name: (
+            name: [
                 _make_eager_call(network, pair),
-                _make_onnx_call(network, pair, Path(folder) / f"{name}.onnx"),
-            )
+                *(
+                    []
+                    if name in _RECURSIVE
+                    else [_make_onnx_call(network, pair, Path(folder) / f"{name}.onnx")]
+                ),
+            ]
             for name, network in built.items()
         }
         times_ms = _measure_ms(calls, turns)
-    return [
-        SpeedRow(
-            network=name,
-            parameters=sum(parameter.numel() for parameter in network.parameters()),
-            multiply_adds=count_multiply_adds(network, HEIGHT_PX, WIDTH_PX),
-            eager_ms=times_ms[name][0],
-            eager_relative=times_ms[name][0] / times_ms[REFERENCE][0],
-            onnx_ms=times_ms[name][1],
-            onnx_relative=times_ms[name][1] / times_ms[REFERENCE][1],
-        )
-        for name, network in built.items()
-    ]
+    return [_make_row(name, network, times_ms) for name, network in built.items()]
+
+
+def _make_row(name: str, network: DisparityNetwork, times_ms: Mapping[str, Sequence[float]]) -> SpeedRow:
+    eager_ms, *onnx = times_ms[name]
+    onnx_ms = onnx[0] if onnx else None
+    eager_reference_ms, onnx_reference_ms = times_ms[REFERENCE]
+    return SpeedRow(
+        network=name,
+        parameters=sum(parameter.numel() for parameter in network.parameters()),
+        multiply_adds=count_multiply_adds(network, HEIGHT_PX, WIDTH_PX),
+        eager_ms=eager_ms,
+        eager_relative=eager_ms / eager_reference_ms,
+        onnx_ms=onnx_ms,
+        onnx_relative=None if onnx_ms is None else onnx_ms / onnx_reference_ms,
+    )
 
 
 def _make_eager_call(network: DisparityNetwork, pair: torch.Tensor) -> Callable[[], object]:
@@ -97,12 +111,12 @@ def _make_onnx_call(network: DisparityNetwork, pair: torch.Tensor, file: Path) -
     return lambda: session.run(None, inputs)
 
 
-def _measure_ms(calls: Mapping[str, tuple[Callable[[], object], ...]], turns: int) -> dict[str, list[float]]:
+def _measure_ms(calls: Mapping[str, Sequence[Callable[[], object]]], turns: int) -> dict[str, list[float]]:
     """Return the median time of each call in milliseconds, by network."""
     taken: dict[str, list[list[float]]] = {name: [[] for _ in both] for name, both in calls.items()}
     for turn in range(-1, turns):  # the first turn warms up
         for name, both in calls.items():
-            if name == "psmnet" and max(turn, 0) % 3:
+            if name in _SLOW and max(turn, 0) % 3:
                 continue
             for times, call in zip(taken[name], both, strict=True):
                 start_s = time.perf_counter()

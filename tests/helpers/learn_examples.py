@@ -36,6 +36,9 @@ RECIPE = Recipe(
     validation_pairs=2,
     validate_every=2,
 )
+# GA-Net pads to multiples of 48, and its recursions take seconds for larger volumes.
+_SMALL_GANET = {"crop_size": (48, 48), "max_disparity_px": 24.0}
+SMALLER = {"ganet_11": _SMALL_GANET, "ganet_deep": _SMALL_GANET}
 # f B = 24 px m: the box of `box_before_a_wall` is at 2 m, its wall at 6 m.
 CAMERA = StereoCamera(focal_px=120.0, baseline_m=0.2, cx_px=47.5, cy_px=31.5)
 
@@ -46,7 +49,8 @@ def recipe_of(model, **changes):
     With 32 candidates a volume would be 2 levels deep, for which oneDNN's bfloat16 gradient is wrong.
     """
     loss = {"weave": "weave", "mc": "hinge"}.get(model.split("_")[0], "l2")
-    return replace(RECIPE, **{"model": model, "loss": loss, "max_disparity_px": 48.0, **changes})
+    fitting = {"model": model, "loss": loss, "max_disparity_px": 48.0, **SMALLER.get(model, {})}
+    return replace(RECIPE, **fitting | changes)
 
 
 def texture(rng, height, width):

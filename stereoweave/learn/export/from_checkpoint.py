@@ -20,6 +20,7 @@ from stereoweave.learn import checkpoint
 from stereoweave.learn.checkpoint import Checkpoint
 from stereoweave.learn.export import confidence as calibrate
 from stereoweave.learn.models import CodeNetwork, build_network
+from stereoweave.learn.models.ganet import GANet
 from stereoweave.learn.models.mc_cnn import MCCNN
 from stereoweave.learn.models.psmnet import PSMNet
 from stereoweave.learn.models.weave import WeaveNet
@@ -33,6 +34,8 @@ OUTPUTS = ["disparity_px", "right_disparity_px", "confidence_logit"]
 # Rounding makes PyTorch and ONNX Runtime differ, but by less than these limits.
 LARGEST_DIFFERENCE_PX = 0.01
 LARGEST_DIFFERENCE_OF_CONFIDENCE = 0.01
+# Networks whose graph is for one size, and what depends on it.
+_SIZED = {PSMNet: "pooling windows", GANet: "recursions over rows and columns"}
 
 
 def export_matcher(trained: Path, out: Path, pairs: Iterable[StereoPair] = ()) -> dict[str, Any]:
@@ -92,7 +95,7 @@ def load_matcher_network(kept: Checkpoint) -> Any:
     """Load a checkpoint's averaged network for matching.
 
     Raises:
-        StereoweaveError: The network estimates depth, or is a PSMNet or an MC-CNN.
+        StereoweaveError: The network estimates depth, or is a PSMNet, a GANet or an MC-CNN.
     """
     network = build_network(kept.recipe)
     network.load_state_dict(kept.averaged)
@@ -109,11 +112,12 @@ def load_matcher_network(kept: Checkpoint) -> Any:
             f"{kept.recipe.name}: expected target = 'disparity', found {kept.recipe.target!r}; "
             "a matcher file has no camera with which to convert depth to disparity"
         )
-    if isinstance(network, PSMNet):
-        raise StereoweaveError(
-            f"{kept.recipe.name}: expected a network for pairs of any size, found psmnet, whose pooling "
-            "windows depend on the size; score it with `stereoweave bench networks`"
-        )
+    for kind, parts in _SIZED.items():
+        if isinstance(network, kind):
+            raise StereoweaveError(
+                f"{kept.recipe.name}: expected a network for pairs of any size, found {kept.recipe.model}, "
+                f"whose {parts} depend on the size; score it with `stereoweave bench networks`"
+            )
     return DisparityNetwork(network, kept.recipe)
 
 

@@ -10,8 +10,10 @@ from stereoweave.errors import FormatError
 from stereoweave.learn.models.densemapnet import DenseMapNet
 from stereoweave.learn.models.dispnet import DispNet
 from stereoweave.learn.models.fast_depth import FastDepthNet
+from stereoweave.learn.models.ganet import GANET_11, GANET_DEEP, GANet
 from stereoweave.learn.models.mc_cnn import MCCNN
 from stereoweave.learn.models.psmnet import PSMNet
+from stereoweave.learn.models.scvnet import SCVNet
 from stereoweave.learn.models.weave import BASE, BASE_GROWN, SMALL, WeaveNet
 from stereoweave.learn.recipe import Recipe
 
@@ -25,7 +27,12 @@ MODELS: dict[str, Callable[..., Any]] = {
     "dispnet": DispNet,
     "psmnet": PSMNet,
     "mc_cnn": MCCNN,
+    "scvnet": SCVNet,
+    "ganet_11": partial(GANet, GANET_11),
+    "ganet_deep": partial(GANet, GANET_DEEP),
 }
+# Networks with candidate disparities, which have the end of the range as an argument.
+_RANGED = "psmnet", "scvnet", "ganet_11", "ganet_deep"
 
 
 @runtime_checkable
@@ -57,7 +64,6 @@ def build_network(recipe: Recipe) -> Any:
     """Build a recipe's network with random weights. Raises FormatError if its name is unknown."""
     if recipe.model not in MODELS:
         raise FormatError(f"{recipe.name}: model = {recipe.model!r}, expected one of {', '.join(MODELS)}")
-    if recipe.model == "psmnet":
-        # The only network whose disparity range is an argument.
-        return PSMNet(int(recipe.max_disparity_px))
+    if recipe.model in _RANGED:
+        return MODELS[recipe.model](max_disparity_px=int(recipe.max_disparity_px))
     return MODELS[recipe.model]()

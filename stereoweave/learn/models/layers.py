@@ -136,6 +136,34 @@ def _diagonals(products: Float[Tensor, "b h n m"], levels: int) -> Float[Tensor,
     return longer[..., :levels]
 
 
+def cost_volume(
+    left: Float[Tensor, "b c h w"], right: Float[Tensor, "b c h w"], levels: int, stride: int = 1
+) -> Float[Tensor, "b c2 d h w"]:
+    """Concatenate the features of column x of `left` and column x - stride * d of `right`, d < levels.
+
+    Right features are 0 if their column is outside the map. A window as wide as the map slides over the right
+    features, which are zero-padded on the left; in the window's last position, d is 0. The plain reference is
+    `cost_volume_plain` in tests/learn/models/test_psmnet.py.
+    """
+    windows = F.pad(right, (stride * (levels - 1), 0)).unfold(3, right.shape[3], stride)
+    shifted = windows.flip(3).transpose(2, 3)
+    return torch.cat([left.unsqueeze(2).expand_as(shifted), shifted], 1)
+
+
+def soft_argmin(cost: Float[Tensor, "b d h w"]) -> Float[Tensor, "b 1 h w"]:
+    """Return the expected disparity under a softmax over matching costs (Kendall et al. 2017).
+
+    Args:
+        cost: Matching cost per candidate [B, D, H, W]; lower costs are better. Candidate i is a disparity of
+            i pixels at this resolution.
+
+    Returns:
+        Disparity [B, 1, H, W] in pixels: left column x corresponds to right column x - disparity.
+    """
+    candidates_px = torch.arange(cost.shape[1], dtype=cost.dtype, device=cost.device).view(1, -1, 1, 1)
+    return ((-cost).softmax(1) * candidates_px).sum(1, keepdim=True)
+
+
 def local_soft_argmax(logits: Float[Tensor, "b d h w"]) -> Float[Tensor, "b 1 h w"]:
     """Return the expected level under a softmax over the levels near the best one.
 

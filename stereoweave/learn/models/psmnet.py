@@ -28,7 +28,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from stereoweave.errors import StereoweaveError
-from stereoweave.learn.models.layers import ConvBlock, pad_to_multiple
+from stereoweave.learn.models.layers import ConvBlock, cost_volume, pad_to_multiple, soft_argmin
 
 
 def norm_convolution(inputs: int, outputs: int, kernel: int, stride: int, dilation: int) -> nn.Sequential:
@@ -117,34 +117,6 @@ class PSMFeatures(nn.Module):
         conv2 = self.conv2(self.conv1(self.conv0(image * 2 - 1)))
         conv4 = self.conv4(self.conv3(conv2))
         return self.fusion(torch.cat([conv2, conv4, self.pyramid(conv4)], 1))
-
-
-def cost_volume(
-    left: Float[Tensor, "b c h w"], right: Float[Tensor, "b c h w"], levels: int
-) -> Float[Tensor, "b c2 d h w"]:
-    """Concatenate the features of column x of `left` and column x - d of `right`, for d = 0 .. levels - 1.
-
-    Right features are 0 if column x - d is outside the map. A window as wide as the map slides over the right
-    features, which are zero-padded on the left; in the window's last position, d is 0. The plain reference is
-    `cost_volume_plain` in tests/learn/models/test_psmnet.py.
-    """
-    windows = F.pad(right, (levels - 1, 0)).unfold(3, right.shape[3], 1)
-    shifted = windows.flip(3).transpose(2, 3)
-    return torch.cat([left.unsqueeze(2).expand_as(shifted), shifted], 1)
-
-
-def soft_argmin(cost: Float[Tensor, "b d h w"]) -> Float[Tensor, "b 1 h w"]:
-    """Return the expected disparity under a softmax over matching costs (Kendall et al. 2017).
-
-    Args:
-        cost: Matching cost per candidate [B, D, H, W]; lower costs are better. Candidate i is a disparity of
-            i pixels at this resolution.
-
-    Returns:
-        Disparity [B, 1, H, W] in pixels: left column x corresponds to right column x - disparity.
-    """
-    candidates_px = torch.arange(cost.shape[1], dtype=cost.dtype, device=cost.device).view(1, -1, 1, 1)
-    return ((-cost).softmax(1) * candidates_px).sum(1, keepdim=True)
 
 
 class Hourglass(nn.Module):

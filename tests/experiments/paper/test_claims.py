@@ -168,6 +168,19 @@ def test_the_networks_are_claimed_what_table_i_comes_to():
     assert (slow.claim, slow.measure) == (NETWORKS_SHORT, "mae_filled")
 
 
+@pytest.mark.parametrize("rival", ["scvnet", "ganet_11"])
+def test_networks_without_numbers_in_the_paper_are_compared_after_psmnets_steps(rival):
+    found = COMPARISONS[f"the paper's network against {rival}: end-point error"]
+    assert (found.paper, found.paper_percent) == ("-", None)
+    assert (found.claim, found.reference, found.changed) == (NETWORKS_SHORT, rival, "fast_depth")
+    rows = [
+        row(NETWORKS_SHORT, rival, steps=150, epe_px=10.0),
+        row(NETWORKS_SHORT, "fast_depth", steps=150, epe_px=8.0),
+    ]
+    cells = line_of(claims_table(rows), f"the paper's network against {rival}: end-point error")
+    assert cells == ["-", "20 (one seed)", "", "one seed: no verdict"]
+
+
 def test_the_settings_of_a_claim_are_ranked_by_the_mae_of_the_filled_view():
     rows = [
         row(PROJECTION, "without", 0, epe_px=1.0, mae_filled=9.0, mae_sourced=1.0),
@@ -205,14 +218,18 @@ def test_networks_stand_beside_the_papers_propeller():
         row(NETWORKS, "fast_depth", 0, epe_cm=40.0, mae_filled=30.0),
         row(NETWORKS, "fast_depth", 1, epe_cm=50.0, mae_filled=32.0),
         row(NETWORKS_SHORT, "psmnet", model="psmnet", steps=150, epe_cm=1.38, mae_filled=41.22),
+        row(NETWORKS_SHORT, "ganet_11", model="ganet_11", steps=150, epe_cm=1.5, mae_filled=42.0),
+        row(NETWORKS_SHORT, "scvnet", model="scvnet", steps=150, epe_cm=2.5, mae_filled=43.0),
         row(NETWORKS_SHORT, "fast_depth", steps=150, epe_cm=60.0, mae_filled=40.0),
         row(PROJECTION, PAPER, epe_cm=0.0, mae_filled=0.0),
     ]
     lines = propeller_table(rows).splitlines()
     assert lines[2:] == [
-        "| psmnet | 150 | 2.38 | 1.38 | -1.00 | 41.22 | 41.22 | +0.00 |",
-        "| fast_depth | 150 | 2.32 | 60.00 | +57.68 | 37.31 | 40.00 | +2.69 |",
-        "| fast_depth | 600 | 2.32 | 45.00 | +42.68 | 37.31 | 31.00 | -6.31 |",
+        "| PSMNet | 150 | 2.38 | 1.38 | -1.00 | 41.22 | 41.22 | +0.00 |",
+        "| SCV-Net | 150 | - | 2.50 |  | - | 43.00 |  |",
+        "| GA-Net-11 | 150 | - | 1.50 |  | - | 42.00 |  |",
+        "| the paper's network | 150 | 2.32 | 60.00 | +57.68 | 37.31 | 40.00 | +2.69 |",
+        "| the paper's network | 600 | 2.32 | 45.00 | +42.68 | 37.31 | 31.00 | -6.31 |",
     ]
     assert {line.count("|") for line in lines} == {9}
 
@@ -241,8 +258,10 @@ def test_run_times_stand_beside_the_papers():
     rows = [
         {"network": "psmnet", **numbers, "eager_relative": "21", "onnx_relative": "12.5"},
         {"network": "another", **numbers, "eager_relative": "2", "onnx_relative": "3"},
+        {"network": "ganet_11", **numbers, "eager_relative": "30", "onnx_ms": "", "onnx_relative": ""},
     ]
     table = run_time_table(rows)
-    assert line_of(table, "psmnet") == ["300", "8.4", "400", "21.00", "80", "12.50", "10", "+2.50"]
+    assert line_of(table, "PSMNet") == ["300", "8.4", "400", "21.00", "80", "12.50", "10", "+2.50"]
+    assert line_of(table, "GA-Net-11") == ["300", "8.4", "400", "30.00", "-", "-", "-", ""]
     assert line_of(table, "another")[-2:] == ["-", ""]
     assert table.splitlines()[0].count("|") == table.splitlines()[2].count("|")

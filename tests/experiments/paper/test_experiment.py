@@ -204,8 +204,8 @@ def test_the_tables_name_what_was_not_run(experiment):
     names.add("fast_depth-l2-p1.25-projection1-steps4-seed0")
     assert not_run == [word for name in sorted(names) for word in ("-", name)]
     assert "against dispnet: end-point error | " in text
-    # Two each against DispNet and PSMNet, and the decoder.
-    assert text.count("| not run | | |") == 6
+    # Two each against DispNet, PSMNet, SCV-Net and GA-Net, and the decoder.
+    assert text.count("| not run | | |") == 10
     assert [line for line in text.splitlines() if line.startswith("| no warping | 6.00 | ")]
     assert "## Transfer" not in text
     assert "Propeller" not in text and "EPE cm" not in text
@@ -387,9 +387,9 @@ def test_the_tables_of_depth_stand_beside_the_papers_propeller(on_disk):
     assert "transfer" not in text.lower()
     table = text.split("## Table I, Propeller\n\n")[1].split("\n\n")[0].splitlines()[2:]
     assert [line.split(" | ")[:3] for line in table] == [
-        ["| densemapnet", "4", "8.67"],
-        ["| psmnet", "1", "2.38"],
-        ["| fast_depth", "4", "2.32"],
+        ["| DenseMapNet", "4", "8.67"],
+        ["| PSMNet", "1", "2.38"],
+        ["| the paper's network", "4", "2.32"],
     ]
     # Without disparity, everything is at 8 m: three quarters of the pixels are off by 2 m, the box by 6 m.
     assert [line for line in text.splitlines() if line.startswith("| no warping | 300.0 | 6.00 | ")]
@@ -407,7 +407,7 @@ def test_run_times_beside_the_report_join_it(experiment, tmp_path):
     speed.write_text(header + "fast_depth,300,9000000000,420,1.1,90,1.25\n")
     write_report(BASE, experiment.of(EARLY), experiment.runs, tmp_path)
     text = (tmp_path / "paper.md").read_text()
-    assert "| fast_depth | 300 | 9.0 | 420 | 1.10 | 90 | 1.25 | 1.05 | +0.20 |" in text
+    assert "| the paper's network | 300 | 9.0 | 420 | 1.10 | 90 | 1.25 | 1.05 | +0.20 |" in text
     assert "## Run time" not in (experiment.out / "paper.md").read_text()
     speed.write_text("network\nfast_depth\n")
     words = complaint(write_report, BASE, experiment.of(EARLY), experiment.runs, tmp_path)

@@ -25,6 +25,8 @@ PLAIN = {"exponent": 1.0, "alpha_p": 0.0}
 DENSEMAPNET = {"model": "densemapnet", **PLAIN}
 DISPNET = {"model": "dispnet", **PLAIN, "loss": "l1", "learning_rate": 1e-4}
 PSMNET = {"model": "psmnet", **PLAIN, "loss": "smooth_l1"}
+SCVNET = {"model": "scvnet", **PLAIN, "loss": "l1"}
+GANET_11 = {"model": "ganet_11", **PLAIN, "loss": "smooth_l1"}
 # Collages of 96x64 with 32 px of disparity, enlarged by half.
 OTHER = {"seed": 100, "pairs": 500, "pair_size": (96, 144), "max_disparity_px": 48.0}
 FIRST = "fast_depth-l2-p1.5-projection1-steps600-seed5"
@@ -38,6 +40,8 @@ DIFFERENCES = {
     (NETWORKS_SHORT, "densemapnet"): {"steps": 150, **DENSEMAPNET},
     (NETWORKS_SHORT, "dispnet"): {"steps": 150, **DISPNET},
     (NETWORKS_SHORT, "psmnet"): {"steps": 150, **PSMNET},
+    (NETWORKS_SHORT, "scvnet"): {"steps": 150, **SCVNET},
+    (NETWORKS_SHORT, "ganet_11"): {"steps": 150, **GANET_11},
     (ADJUSTMENT, "p = 1"): {"exponent": 1.0},
     (ADJUSTMENT, "p = 1.25"): {"exponent": 1.25},
     (ADJUSTMENT, "p = 1.5"): {},

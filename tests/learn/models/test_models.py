@@ -23,6 +23,10 @@ PARAMETERS = {
     "dispnet": 42_174_022,
     "psmnet": 5_224_768,
     "mc_cnn": 148_352,
+    "scvnet": 2_315_654,
+    "ganet_11": 4_483_728,
+    # As published, less 6,560 of a layer without use: 8 * 8 * 3 * 4 * 4 + 16 * 8 * 27 and two batch norms.
+    "ganet_deep": 6_580_112 - 6_560,
 }
 CODE_NETWORKS = [name for name in MODELS if not name.startswith(("weave", "mc_cnn"))]
 # Loss, learning rate and steps with which each network overfits one pair.
@@ -32,6 +36,9 @@ LEARNS = {
     "densemapnet": ("l2", 2e-3, 20),
     "dispnet": ("l1", 3e-4, 25),
     "psmnet": ("l2", 2e-3, 16),
+    "scvnet": ("l1", 1e-3, 20),
+    "ganet_11": ("l2", 2e-3, 12),
+    "ganet_deep": ("l2", 2e-3, 12),
 }
 
 
@@ -127,7 +134,7 @@ def test_the_network_overfits_one_pair(name):
         for part in (network.conv4, network.conv5, network.conv6, *network.expansions[:2]):
             part.requires_grad_(False)
     objective = build_objective(recipe, network)
-    batch = collate([box_before_a_wall(np.random.default_rng(0), (64, 64))])
+    batch = collate([box_before_a_wall(np.random.default_rng(0), recipe.crop_size)])
     trained = [parameter for parameter in network.parameters() if parameter.requires_grad]
     optimiser = torch.optim.Adam(trained, learning_rate, fused=True)
     errors_px = []
@@ -151,5 +158,5 @@ def test_the_error_for_an_unknown_network_lists_the_known_ones():
         build_network(recipe_of("spider"))
     assert str(caught.value) == (
         "tiny: model = 'spider', expected one of weave_small, weave_base, weave_base_grown, fast_depth, "
-        "fast_depth_without_skips, densemapnet, dispnet, psmnet, mc_cnn"
+        "fast_depth_without_skips, densemapnet, dispnet, psmnet, mc_cnn, scvnet, ganet_11, ganet_deep"
     )

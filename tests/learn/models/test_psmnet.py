@@ -7,19 +7,20 @@ import torch
 import torch.nn.functional as F
 
 from stereoweave.errors import StereoweaveError
-from stereoweave.learn.models.psmnet import PSMNet, _disparity_px, cost_volume, soft_argmin
+from stereoweave.learn.models.layers import cost_volume, soft_argmin
+from stereoweave.learn.models.psmnet import PSMNet, _disparity_px
 
 # For volumes this small, sharing the work among threads costs more than computing.
 torch.set_num_threads(1)
 
 
-def cost_volume_plain(left, right, levels):
+def cost_volume_plain(left, right, levels, stride=1):
     batch, channels, height, width = left.shape
     volume = torch.zeros(batch, 2 * channels, levels, height, width)
     for level in range(levels):
         volume[:, :channels, level] = left
-        for x in range(level, width):
-            volume[:, channels:, level, :, x] = right[:, :, :, x - level]
+        for x in range(stride * level, width):
+            volume[:, channels:, level, :, x] = right[:, :, :, x - stride * level]
     return volume
 
 
@@ -45,11 +46,12 @@ def test_192_disparities_are_candidates_by_default():
         assert PSMNet().max_disparity_px == 192
 
 
-@pytest.mark.parametrize("levels", [1, 4, 7, 9])
-def test_the_cost_volume_equals_the_plain_one(levels):
+@pytest.mark.parametrize(("levels", "stride"), [(1, 1), (4, 1), (7, 1), (9, 1), (3, 3), (4, 2), (1, 3)])
+def test_the_cost_volume_equals_the_plain_one(levels, stride):
     torch.manual_seed(0)
     left, right = torch.rand(2, 2, 3, 4, 7)
-    assert torch.equal(cost_volume(left, right, levels), cost_volume_plain(left, right, levels))
+    found = cost_volume(left, right, levels, stride)
+    assert torch.equal(found, cost_volume_plain(left, right, levels, stride))
 
 
 def test_features_shifted_by_two_columns_are_equal_at_level_two():
