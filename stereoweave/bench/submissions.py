@@ -123,7 +123,10 @@ def _claim(folder: Path, facts: dict[str, Any]) -> None:
         expected = "the settings of an unfinished submission"
         with reading(path, expected):
             found = parse_description(path, path.read_text(encoding="utf-8"), expected)
-        check_claim(path, facts, found)
+        try:
+            check_claim(path, facts, found)
+        except StereoweaveError as error:
+            raise error.with_detail(f"or remove {folder} to start anew") from error
     else:
         check_unclaimed(
             folder, _SETTINGS_FILE, (entry.name for entry in folder.iterdir() if entry.name[0] != ".")

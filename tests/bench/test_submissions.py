@@ -224,6 +224,7 @@ def test_an_error_says_where_finished_pairs_are_and_other_settings_do_not_resume
     damaged.write_bytes(whole)
     message = error_of(lambda: write_submission(out, submission, backend, refined=True, console=QUIET))
     assert "expected refined = true for this run, found false" in message
+    assert message.endswith(f"; or remove {out}.parts to start anew")
     network = write_constant_matcher(tmp_path / "constant.onnx", 2.0)
     other = Backend(model=network, threads=1)
     assert "expected model = " in error_of(lambda: write_submission(out, submission, other, console=QUIET))
