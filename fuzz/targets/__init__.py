@@ -10,7 +10,7 @@ from stereoweave.errors import StereoweaveError
 
 NAMES = (
     *("pictures", "calibrations", "maps", "pair_lists", "recipes", "shards", "matchers"),
-    *("checkpoints", "videos", "marks", "service", "connections", "page"),
+    *("checkpoints", "videos", "marks", "submissions", "service", "connections", "page"),
 )
 
 

@@ -1,4 +1,7 @@
-"""The commands `stereoweave bench pairs | collages | views | flicker | networks | parity | training`."""
+"""The commands `stereoweave bench pairs | collages | views | flicker | networks | parity | training`.
+
+`submit` is in its own module.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -19,6 +22,7 @@ from stereoweave.cli.options import (
     require_synth_extra,
     require_train_extra,
 )
+from stereoweave.cli.submit import submit
 from stereoweave.cli.tables import (
     FLICKER_TABLES,
     PAIRS_TABLES,
@@ -86,6 +90,7 @@ McCnn = Annotated[
 ]
 
 bench = Commands("Score matchers, new views, videos and trained networks.")
+bench.command()(submit)
 
 
 @bench.command()

@@ -52,7 +52,7 @@ def test_a_command_names_a_setting_by_its_own_option(command, setting, option):
 
 
 def test_every_command_names_its_own_options():
-    assert len(COMMANDS) == 25
+    assert len(COMMANDS) == 26
     assert {type(command) for command in COMMANDS.values()} == {Command}
 
 
