@@ -26,12 +26,14 @@ class StillFrame:
     Attributes:
         pictures: Small pictures of the frame.
         last_s: Time of the video's last frame in seconds, rounded down to a tenth.
-        notes: Notes on the video and the frame, in the form's words.
+        facts: What the video is, in the form's words.
+        warnings: What is wrong with the frame, likewise.
     """
 
     pictures: FramePictures
     last_s: float
-    notes: list[str]
+    facts: list[str]
+    warnings: list[str]
 
 
 def convert_still(upload: VideoUpload, report: Callable[[float, str], None]) -> StillFrame:
@@ -59,5 +61,6 @@ def convert_still(upload: VideoUpload, report: Callable[[float, str], None]) -> 
     return StillFrame(
         make_pictures(seen[0], upload.output, begin_s=start_s, longer_side_px=_LONGER_SIDE_PX),
         floor(last_s * _STEPS_PER_S) / _STEPS_PER_S,
-        [note.format(job.name_of) for note in notes],
+        [note.format(job.name_of) for note in still.notes],
+        [note.format(job.name_of) for note in notes if note not in still.notes],
     )

@@ -194,7 +194,7 @@ class VideoTab:
     def _show_result(self, made: ConvertedVideo) -> dict[Any, Any]:
         size_mb = made.file.stat().st_size / 1e6
         return {
-            self._status: format_warnings(made.warnings) + format_notice([made.summary]),
+            self._status: format_warnings(made.warnings) + format_notice([made.summary, *made.facts]),
             self._shown: gr.update(value=str(made.file), visible=True),
             self._file: gr.update(
                 value=str(made.file), label=f"Download {made.file.name} ({size_mb:.1f} MB)", visible=True
@@ -245,7 +245,7 @@ class VideoTab:
             still = await self._host.work(request, work, progress)
         except (StereoweaveError, OSError) as error:
             return {self._status: self._wording.format_error(error), **self._panel.hide()}
-        said = format_warnings(still.notes) + format_notice([_ABOUT_FRAME])
+        said = format_warnings(still.warnings) + format_notice([_ABOUT_FRAME, *still.facts])
         return {self._status: said, **self._panel.show_still(still)}
 
     def _read(self, given: dict[Any, Any], start_s: float | None) -> VideoUpload:

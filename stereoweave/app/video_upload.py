@@ -58,10 +58,11 @@ class VideoUpload:
 
 @dataclass(frozen=True)
 class ConvertedVideo:
-    """A converted video: its file, a line about it, and warnings."""
+    """A converted video: its file, a line about it, what its source is, and warnings."""
 
     file: Path
     summary: str
+    facts: list[str]
     warnings: list[str]
 
 
@@ -89,7 +90,9 @@ def convert_upload(upload: VideoUpload, folder: Path, report: Callable[[float, s
     if upload.start_s is not None:
         whole_s = whole_count / tally.frames_per_s
         summary += f" A preview has no sound. The whole video takes about {format_duration(whole_s)}."
-    return ConvertedVideo(out, summary, [*console.lines, *_describe_problems(tally)])
+    facts = [note.format(upload.name_of) for note in video.notes]
+    warnings = [line for line in console.lines if line not in facts]
+    return ConvertedVideo(out, summary, facts, [*warnings, *_describe_problems(tally)])
 
 
 def open_upload(upload: VideoUpload, report: Callable[[float, str], None]) -> "StereoVideo":

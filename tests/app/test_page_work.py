@@ -452,7 +452,8 @@ def test_a_spatial_video_is_converted_with_a_note(tmp_path):
     wish = replace(ask(SPATIAL, start_s=0.5), format=None)
     made = convert_upload(wish, tmp_path, lambda share, what: None)
     assert "320×192 px" in made.summary
-    assert [line[:38] for line in made.warnings] == ["spatial video (MV-HEVC), left view fir"]
+    assert [line[:38] for line in made.facts] == ["spatial video (MV-HEVC), left view fir"]
+    assert made.warnings == []
     with pytest.raises(StereoweaveError, match="found side_by_side; leave it out"):
         convert_upload(ask(SPATIAL, start_s=None), tmp_path, lambda share, what: None)
 

@@ -69,7 +69,8 @@ def test_a_spatial_video_shows_its_left_view_and_what_was_found(testdata):
     still = show(ask(SPATIAL, start_s=1.0, output="side_by_side"))
     assert opened(still.pictures.left).shape == (192, 320, 3)
     assert opened(still.pictures.made).shape == (192, 640, 3)
-    assert any(note.startswith("spatial video (MV-HEVC), left view first") for note in still.notes)
+    assert [line[:38] for line in still.facts] == ["spatial video (MV-HEVC), left view fir"]
+    assert still.warnings == []
 
 
 @pytest.mark.testdata
