@@ -3,6 +3,7 @@
 Finished pairs are kept in a folder beside the archive, from which an interrupted run resumes.
 """
 
+import hashlib
 import math
 import shutil
 import time
@@ -18,6 +19,7 @@ import numpy as np
 from jaxtyping import Float32
 from rich.console import Console
 
+from stereoweave import __version__
 from stereoweave.bench.submission_check import find_problems
 from stereoweave.bench.submission_formats import Submission
 from stereoweave.data.benchmarks import BenchmarkPair
@@ -28,9 +30,8 @@ from stereoweave.io.output_lock import lock_output
 from stereoweave.io.run_folder import check_claim, check_unclaimed, describe_run, parse_description
 from stereoweave.matching.backend import Backend
 from stereoweave.matching.estimate import match
-from stereoweave.matching.matcher import Matcher
+from stereoweave.matching.matcher import Matcher, model_file
 from stereoweave.matching.options import MatchOptions
-from stereoweave.outputs.results import DepthJob, job_facts
 from stereoweave.system.progress import progress
 
 _SETTINGS_FILE = "submission.json"
@@ -108,9 +109,13 @@ def write_submission(
 
 def _describe(submission: Submission, backend: Backend, refined: bool) -> dict[str, Any]:
     """Return what determines maps and times; the method's name does not."""
-    facts = job_facts(DepthJob(backend=backend, options=MatchOptions(refined=refined)))
+    network = model_file(backend.model)
+    with reading(network, "a matcher file"):
+        digest = hashlib.sha256(network.read_bytes()).hexdigest()
     return {
-        **{name: facts[name] for name in ("stereoweave", "model", "refined")},
+        "stereoweave": __version__,
+        "model": f"{Path(backend.model).name} {digest[:12]}",
+        "refined": refined,
         "provider": backend.provider,
         "threads": backend.threads,
         "dataset": submission.dataset,
