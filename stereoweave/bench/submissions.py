@@ -3,18 +3,23 @@
 Finished pairs are kept in a folder beside the archive, from which an interrupted run resumes.
 """
 
+import hashlib
 import math
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 from zipfile import ZIP_DEFLATED, ZipFile
 
+import numpy as np
+from jaxtyping import Float32
 from rich.console import Console
 
+from stereoweave import __version__
 from stereoweave.bench.submission_check import find_problems
 from stereoweave.bench.submission_formats import Submission
 from stereoweave.data.benchmarks import BenchmarkPair
@@ -25,9 +30,8 @@ from stereoweave.io.output_lock import lock_output
 from stereoweave.io.run_folder import check_claim, check_unclaimed, describe_run, parse_description
 from stereoweave.matching.backend import Backend
 from stereoweave.matching.estimate import match
-from stereoweave.matching.matcher import Matcher
+from stereoweave.matching.matcher import Matcher, model_file
 from stereoweave.matching.options import MatchOptions
-from stereoweave.outputs.results import DepthJob, job_facts
 from stereoweave.system.progress import progress
 
 _SETTINGS_FILE = "submission.json"
@@ -92,9 +96,9 @@ def write_submission(
         _claim(folder, _describe(submission, backend, refined))
         missing = [pair for pair in submission.pairs if not _is_finished(folder, submission, pair)]
         with _keeping_parts(folder):
-            _match_pairs(folder, submission, missing, matcher, refined, console)
-            times_s = [_read_time_s(folder, pair) for pair in submission.pairs]
-            _pack(out, folder, submission, times_s)
+            _match_pairs(folder, submission, missing, partial(_match_timed, matcher, refined), console)
+        times_s = [_read_time_s(folder, pair) for pair in submission.pairs]
+        _pack(out, folder, submission, times_s)
         shutil.rmtree(folder)
     return Written(
         made=len(missing),
@@ -105,9 +109,13 @@ def write_submission(
 
 def _describe(submission: Submission, backend: Backend, refined: bool) -> dict[str, Any]:
     """Return what determines maps and times; the method's name does not."""
-    facts = job_facts(DepthJob(backend=backend, options=MatchOptions(refined=refined)))
+    network = model_file(backend.model)
+    with reading(network, "a matcher file"):
+        digest = hashlib.sha256(network.read_bytes()).hexdigest()
     return {
-        **{name: facts[name] for name in ("stereoweave", "model", "refined")},
+        "stereoweave": __version__,
+        "model": f"{Path(backend.model).name} {digest[:12]}",
+        "refined": refined,
         "provider": backend.provider,
         "threads": backend.threads,
         "dataset": submission.dataset,
@@ -150,12 +158,11 @@ def _keeping_parts(folder: Path) -> Iterator[None]:
         raise
 
 
-def _match_pairs(  # noqa: PLR0913 - work, and progress
+def _match_pairs(
     folder: Path,
     submission: Submission,
     pairs: list[BenchmarkPair],
-    matcher: Matcher,
-    refined: bool,
+    match_timed: Callable[[BenchmarkPair], tuple[Float32[np.ndarray, "h w"], float]],
     console: Console,
 ) -> None:
     if not pairs:
@@ -163,9 +170,9 @@ def _match_pairs(  # noqa: PLR0913 - work, and progress
     total = len(submission.pairs)
     with progress(console) as bar:
         shown = bar.add_task("matching", total=total, completed=total - len(pairs), loss="", rate="")
-        _match_timed(pairs[0], matcher, refined)  # compiles kernels and reserves memory
+        match_timed(pairs[0])  # compiles kernels and reserves memory
         for pair in pairs:
-            disparity_px, time_s = _match_timed(pair, matcher, refined)
+            disparity_px, time_s = match_timed(pair)
             # A pair counts as finished once its map exists.
             with replacing(_time_path(folder, pair)) as temporary:
                 temporary.write_text(repr(time_s))
@@ -173,7 +180,9 @@ def _match_pairs(  # noqa: PLR0913 - work, and progress
             bar.update(shown, advance=1, rate=f"{pair.name} {time_s:.2f} s")
 
 
-def _match_timed(pair: BenchmarkPair, matcher: Matcher, refined: bool) -> tuple[Any, float]:
+def _match_timed(
+    matcher: Matcher, refined: bool, pair: BenchmarkPair
+) -> tuple[Float32[np.ndarray, "h w"], float]:
     """Return the disparity of the left view in px, float32 [H, W], and the time of matching in seconds."""
     pictures = read_pair(pair.left, pair.right)
     options = MatchOptions(range_px=pair.range_px, refined=refined)

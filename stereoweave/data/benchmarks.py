@@ -15,6 +15,8 @@ RESOLUTIONS = {"F": "full", "H": "half", "Q": "quarter"}
 """Middlebury's letters for the sizes of its pictures, which end the names of its folders."""
 
 _NDISP = re.compile(r"^ndisp\s*=\s*(\S+)\s*$", re.MULTILINE)
+# Names become names of files in an archive.
+_NAME = re.compile(r"[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)?")
 _NUMBER = re.compile(r"[1-9][0-9]{0,5}")
 
 
@@ -214,6 +216,8 @@ def _open_scene(name: str, part: str, scene: Path) -> BenchmarkPair:
 def _open_pair(
     name: str, part: str, left: Path, right: Path, calibration: Path | None = None
 ) -> BenchmarkPair:
+    if not _NAME.fullmatch(name):
+        raise FormatError(f"{left}: expected a name of letters, digits, '.', '-' and '_', found {name!a:.60}")
     size_px, right_size_px = (_read_size(path) for path in (left, right))
     if size_px != right_size_px:
         raise FormatError(

@@ -247,7 +247,10 @@ def test_a_damaged_part_is_found_before_the_archive_has_its_name(backend, tmp_pa
     smaller = replace(ours, write_map=lambda path, disparity_px: ours.write_map(path, disparity_px[1:]))
     monkeypatch.setitem(FORMATS, "kitti2015", smaller)
     message = error_of(lambda: write_submission(out, submission, backend, console=QUIET))
-    assert "not written; disp_0/000000_10.png: expected 40x32 pixels" in message
+    assert message == (
+        f"{out}: not written; disp_0/000000_10.png: expected 40x32 pixels, the size of the pictures, "
+        f"found 40x31; remove {out}.parts, and run the command again"
+    )
     assert not out.exists()
 
 

@@ -141,6 +141,14 @@ def test_a_calibration_that_is_missing_or_says_nothing_is_an_error(tmp_path):
     assert message == f"{calibration}: expected a calibration with ndisp, found no such file"
 
 
+@pytest.mark.parametrize(("name", "shown"), [("two words", "two words"), ("gr\udcfcn", "gr\\udcfcn")])
+def test_a_name_that_an_archive_could_not_hold_everywhere_is_an_error(tmp_path, name, shown):
+    write_scene(tmp_path / "two_view_training" / "scene")
+    (tmp_path / "two_view_training" / "scene").rename(tmp_path / "two_view_training" / name)
+    message = error_of(list_benchmark, tmp_path, "eth3d", Choice(training_only=True))
+    assert message.endswith(f"expected a name of letters, digits, '.', '-' and '_', found '{shown}'")
+
+
 def test_an_empty_download_has_no_pairs(tmp_path):
     for folder in KITTI["kitti2015"]:
         (tmp_path / "testing" / folder).mkdir(parents=True)
