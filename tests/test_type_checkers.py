@@ -5,9 +5,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from jaxtyping import TypeCheckError
 
 import stereoweave as sw
+from stereoweave.io.colormap import colour_disparity
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 # The line numbers of the errors are the keys.
@@ -50,3 +53,10 @@ def test_results_have_types(complaints):
 
 def test_every_public_name_is_known(complaints):
     assert complaints.keys() == WRONG.keys()
+
+
+@pytest.mark.parametrize(("shape", "range_px"), [((3,), (0.0, 1.0)), ((2, 2), "far")])
+def test_within_the_tests_shapes_and_types_of_arguments_are_checked(shape, range_px):
+    for _ in range(2):  # the first call builds the check
+        with pytest.raises(TypeCheckError):
+            colour_disparity(np.zeros(shape, np.float32), range_px)

@@ -25,29 +25,43 @@ def lower(example):
     return example.left[:-DOWN_PX], example.right[DOWN_PX:]
 
 
-def test_a_pair_out_of_line_is_aligned_on_request(example, lower):
-    found = sw.estimate(*lower, align="auto")
-    expected_px = sw.estimate(example.left, example.right).disparity_px[:-DOWN_PX]
+@pytest.fixture(scope="module")
+def estimate(example):
+    return sw.estimate(example.left, example.right)
+
+
+@pytest.fixture(scope="module")
+def unaligned(lower):
+    return sw.estimate(*lower)
+
+
+@pytest.fixture(scope="module")
+def aligned(lower):
+    return sw.estimate(*lower, align="auto")
+
+
+def test_a_pair_out_of_line_is_aligned_on_request(estimate, unaligned, aligned):
+    found = aligned
+    expected_px = estimate.disparity_px[:-DOWN_PX]
     sure = found.pair.left_seen & (found.confidence > 0.9)
     assert sure.mean() > 0.6
     # Where infinity is after alignment is unknown, so all disparities may be off by the same number.
     off_px = (found.disparity_px - expected_px)[sure]
     assert np.median(np.abs(off_px - np.median(off_px))) < 0.5
-    unaligned_px = (sw.estimate(*lower).disparity_px - expected_px)[sure]
+    unaligned_px = (unaligned.disparity_px - expected_px)[sure]
     assert np.median(np.abs(unaligned_px - np.median(unaligned_px))) > 2
 
 
-def test_a_view_of_an_aligned_estimate_shows_the_aligned_pair(lower):
-    found = sw.estimate(*lower, align="auto")
-    view = sw.render(*lower, found, 0.0)
-    np.testing.assert_array_equal(view.image, found.pair.left)
+def test_a_view_of_an_aligned_estimate_shows_the_aligned_pair(lower, aligned):
+    view = sw.render(*lower, aligned, 0.0)
+    np.testing.assert_array_equal(view.image, aligned.pair.left)
 
 
-def test_the_estimate_says_how_the_pair_was_aligned(lower, example):
-    (note,) = sw.estimate(*lower, align="auto").notes
+def test_the_estimate_says_how_the_pair_was_aligned(example, unaligned, aligned):
+    (note,) = aligned.notes
     assert str(note).startswith("rectified: rows are off by ")
     assert "no_rectify" not in str(note)
-    assert sw.estimate(*lower).notes == ()
+    assert unaligned.notes == ()
     swapped = sw.estimate(example.right, example.left, align="auto")
     assert list(map(str, swapped.notes)) == ["left and right were swapped, and have been swapped back"]
 
@@ -64,11 +78,11 @@ def test_the_estimate_says_which_problems_remain(example):
     assert sw.estimate(example.left, example.left).notes == ()
 
 
-def test_a_sound_pair_gives_the_same_with_and_without_alignment(example):
+def test_a_sound_pair_gives_the_same_with_and_without_alignment(example, estimate):
     aligned = sw.estimate(example.left, example.right, align="auto")
     assert aligned.pair is None
     assert aligned.notes == ()
-    np.testing.assert_array_equal(aligned.disparity_px, sw.estimate(example.left, example.right).disparity_px)
+    np.testing.assert_array_equal(aligned.disparity_px, estimate.disparity_px)
 
 
 @pytest.mark.usefixtures("without_shape_checks")
@@ -77,11 +91,11 @@ def test_another_kind_of_alignment_is_refused(example):
         sw.estimate(example.left, example.right, align="always")
 
 
-def test_one_file_with_both_views_is_a_pair(example, tmp_path):
+def test_one_file_with_both_views_is_a_pair(example, estimate, tmp_path):
     both = tmp_path / "both.png"
     write_image(both, np.hstack([example.left, example.right]))
     found = sw.estimate(both)
-    np.testing.assert_array_equal(found.disparity_px, sw.estimate(example.left, example.right).disparity_px)
+    np.testing.assert_array_equal(found.disparity_px, estimate.disparity_px)
     np.testing.assert_array_equal(found.pair.right, example.right)
     assert found.pair.camera is None
     assert [str(note).partition(",")[0] for note in found.notes] == ["side_by_side"]
