@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import cv2
 
-from stereoweave.app.spatial_capture import SpatialCapture
+from stereoweave.app.apart_capture import ApartCapture
 from stereoweave.errors import FormatError, Note, StereoweaveError
 from stereoweave.pictures.pair_layouts import Picture
 from stereoweave.stereo import StereoCamera
@@ -26,7 +26,7 @@ class Moment(NamedTuple):
 
     Attributes:
         number: Number of the moment, counted from 0.
-        pictures: One image per source; of a spatial video, the left and the right view.
+        pictures: One image per source; of a video whose views are apart, the left and the right view.
         taken_s: Time of capture, as returned by `time.monotonic`.
     """
 
@@ -44,6 +44,7 @@ class Capture:
         sources: One source with both views, or a left and a right source. Each is a camera number, a video
             file, a stream address, or a series of pictures such as frame%03d.png.
         loop: Begin a video file or a series of pictures again at its end. Cameras and streams have no end.
+        format: Frame packing of a single source, a name in `FRAME_PACKINGS`. Default: as the source says.
 
     Attributes:
         name: The sources, for messages.
@@ -53,29 +54,31 @@ class Capture:
         notes: Notes on the source.
 
     Raises:
-        FormatError: If a source cannot be opened, or one of two is a spatial video.
+        FormatError: If a source cannot be opened, or one of two has both views.
         StereoweaveError: If there are more than two sources.
     """
 
-    def __init__(self, sources: Sequence[str], *, loop: bool = False) -> None:
+    def __init__(self, sources: Sequence[str], *, loop: bool = False, format: str | None = None) -> None:
         if len(sources) > 2:
             raise StereoweaveError(
                 f"expected one source with both views, or a left and a right source, found {len(sources)}: "
                 f"{' '.join(sources)}"
             )
         self.name, self.count = " and ".join(sources), len(sources)
-        self._sources = sources
-        self._captures = [_open_source(source) for source in sources]
+        self._sources, self._format = sources, format
+        self._captures = [_open_source(source, format) for source in sources]
         first = self._captures[0]
-        self.is_spatial = any(isinstance(capture, SpatialCapture) for capture in self._captures)
+        apart = [capture for capture in self._captures if isinstance(capture, ApartCapture)]
+        self.is_spatial = any(capture.packing is None for capture in apart)
         self.camera: StereoCamera | None = None
         self.notes: Sequence[Note] = ()
-        if isinstance(first, SpatialCapture) and len(sources) == 1:
+        if isinstance(first, ApartCapture) and len(sources) == 1:
             self.count, self.camera, self.notes = 2, first.camera, first.notes
-        elif self.is_spatial:
+        elif apart:
+            kind = "spatial video (MV-HEVC)" if self.is_spatial else f"video ({apart[0].packing})"
             raise FormatError(
-                f"{self.name}: expected a left and a right video with one view each, found a spatial video "
-                "(MV-HEVC) with both views; give it alone"
+                f"{self.name}: expected a left and a right video with one view each, found a {kind} with "
+                "both views; give it alone"
             )
         # A single picture or a recorded stream has no frame count.
         self._is_recording = _count_frames(first) > 0 or Path(sources[0]).is_file()
@@ -141,7 +144,7 @@ class Capture:
         """Begin again. The files are opened anew, because a series of pictures cannot be wound back."""
         self._release()
         with suppress(FormatError):  # a file that is gone ends the video
-            self._captures = [_open_source(source) for source in self._sources]
+            self._captures = [_open_source(source, self._format) for source in self._sources]
 
     def _release(self) -> None:
         for capture in self._captures:
@@ -155,28 +158,28 @@ class Capture:
         return sum(pictures, ()) if all(pictures) else None
 
 
-_Source = cv2.VideoCapture | SpatialCapture
+_Source = cv2.VideoCapture | ApartCapture
 
 
 def _retrieve(capture: _Source) -> tuple[Picture, ...]:
     """Return the images that were grabbed; none if they cannot be decoded."""
-    if isinstance(capture, SpatialCapture):
+    if isinstance(capture, ApartCapture):
         return capture.retrieve()
     well, frame = capture.retrieve()
     return (cv2.cvtColor(frame, cv2.COLOR_BGR2RGB),) if well else ()
 
 
 def _count_frames(capture: _Source) -> float:
-    return 1 if isinstance(capture, SpatialCapture) else capture.get(cv2.CAP_PROP_FRAME_COUNT)
+    return 1 if isinstance(capture, ApartCapture) else capture.get(cv2.CAP_PROP_FRAME_COUNT)
 
 
 def _measure_rate(capture: _Source) -> float:
-    return capture.rate if isinstance(capture, SpatialCapture) else capture.get(cv2.CAP_PROP_FPS)
+    return capture.rate if isinstance(capture, ApartCapture) else capture.get(cv2.CAP_PROP_FPS)
 
 
-def _open_source(source: str) -> _Source:
-    if spatial := SpatialCapture.open(source):
-        return spatial
+def _open_source(source: str, format: str | None) -> _Source:
+    if apart := ApartCapture.open(source, format):
+        return apart
     level = cv2.utils.logging.getLogLevel()
     # A failure is reported by the error below; OpenCV would also print a line about it.
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)

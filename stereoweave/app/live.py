@@ -82,7 +82,7 @@ def show(  # noqa: PLR0913 - source, output and settings
         screen: Web page that shows the images.
         matcher: Matcher that estimates the disparity.
         tally: Statistics, updated with each frame so that they are valid even after an error.
-        format: Frame packing of a single source, a name in `PAIR_LAYOUTS`. Default: detected.
+        format: Frame packing of a single source, a name in `FRAME_PACKINGS`. Default: detected.
         rig: Calibration with which to rectify the images. Default: the images are already rectified, by the
             camera that a spatial video declares.
         tell: Function that is called with each note on the sources, at the first frame.
@@ -92,6 +92,8 @@ def show(  # noqa: PLR0913 - source, output and settings
     """
     if capture.is_spatial:
         check_unpacked(capture.name, format)
+    if capture.count == 2:
+        format = None
     range_px: tuple[float, float] | None = None
     while moment := capture.newest(tally.last):
         if capture.count == 1 and format is None:

@@ -17,7 +17,8 @@ Sources = Annotated[
     typer.Argument(
         metavar="SOURCE",
         help="Camera number, video file, stream URL, or picture sequence such as frame%03d.png, with both "
-        "views in each frame; or two such sources, LEFT RIGHT.",
+        "views in each frame; a video file with both views in two streams or in turn, or a spatial video; or "
+        "two sources, LEFT RIGHT.",
     ),
 ]
 Format = Annotated[
@@ -62,18 +63,18 @@ def live(  # noqa: PLR0913 - each is an option of the command line
     from stereoweave.app.screen import Screen
     from stereoweave.cameras.calibration_files import read_rig
     from stereoweave.matching.backend import Backend
-    from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS
+    from stereoweave.video.packings import FRAME_PACKINGS
 
     format = replace_old_option(("--arrangement", arrangement), ("--format", format))
-    if format not in (None, *PAIR_LAYOUTS) or (format and len(sources) > 1):
+    if format not in (None, *FRAME_PACKINGS) or (format and len(sources) > 1):
         raise StereoweaveError(
-            f"expected one of {', '.join(PAIR_LAYOUTS)}, for a single source with both views in each frame, "
+            f"expected one of {', '.join(FRAME_PACKINGS)}, for a single source with both views, "
             f"found {format} for {' '.join(sources)}",
             setting="format",
         )
     rig = read_rig(calib) if calib else None
     matcher, tally = Backend(model=model, threads=threads, provider=provider).matcher(), LiveTally()
-    with Screen(port) as screen, Capture(sources, loop=loop) as capture:
+    with Screen(port) as screen, Capture(sources, loop=loop, format=format) as capture:
         typer.echo(f"{capture.name}: shown at {screen.url}; Ctrl-C stops it")
         if browser:
             webbrowser.open(screen.url)

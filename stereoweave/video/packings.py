@@ -5,6 +5,8 @@ from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS
 # Whether the right view comes first, by the packing's name.
 FRAME_SEQUENTIAL = {"frame_sequential": False, "frame_sequential_right_first": True}
 TWO_STREAMS = {"two_streams": False, "two_streams_right_first": True}
+# Packings of which no frame holds both views.
+APART = frozenset({*FRAME_SEQUENTIAL, *TWO_STREAMS})
 FRAME_PACKINGS = (*PAIR_LAYOUTS, *FRAME_SEQUENTIAL, *TWO_STREAMS)
 
 

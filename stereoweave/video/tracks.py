@@ -20,6 +20,7 @@ from stereoweave.io.images import read_image
 from stereoweave.io.unreadable import check_readable
 from stereoweave.stereo import StereoCamera
 from stereoweave.video.colours import convert_to_fine, convert_to_rgb, hdr_colours, name_hdr
+from stereoweave.video.packings import FRAME_SEQUENTIAL
 from stereoweave.video.spatial import RIGHT, Stereo3D, ViewPair, is_spatial, pair_views, read_stereo3d
 from stereoweave.video.sphere_marks import SphereMark, read_sphere
 
@@ -346,9 +347,20 @@ def open_track(path: Path, rate: Fraction | None) -> Track:
 
 def is_spatial_file(path: Path) -> bool:
     """Return whether a file is a spatial video (MV-HEVC); False for a file that cannot be decoded."""
+    return shows_one_view(path, spatial_only=True)
+
+
+def shows_one_view(path: Path, *, spatial_only: bool = False) -> bool:
+    """Return whether a file says that each frame shows one view: of a spatial video, or of two views in turn.
+
+    False for a file that cannot be decoded.
+    """
     with suppress(StereoweaveError), _opening(path) as (container, stream):
         first = next(_drop_corrupt(_decode(container, stream)), None)
-        return first is not None and stream.codec_context.name == "hevc" and is_spatial(first)
+        if first is not None and stream.codec_context.name == "hevc" and is_spatial(first):
+            return True
+        declared = None if spatial_only or first is None else read_stereo3d(first)
+        return declared is not None and _name_packing(declared) in FRAME_SEQUENTIAL
     return False
 
 

@@ -11,8 +11,10 @@ from urllib.parse import urlsplit
 import cv2
 import numpy as np
 import pytest
+import video_examples
 from browsers import chromium
 from spatial_examples import SPATIAL, psnr_db, spatial_pairs
+from video_examples import example_pairs, write_streams
 
 from stereoweave.app.capture import Capture
 from stereoweave.app.live import LiveTally, compose, describe_middle, follow_range, label_values, show
@@ -400,6 +402,61 @@ def test_a_spatial_video_with_another_one_or_a_frame_packing_is_refused(tmp_path
         pytest.raises(StereoweaveError, match="found crossed; leave it out"),
     ):
         show(capture, screen, Matcher(), LiveTally(), format="crossed")
+
+
+def last_pair(monkeypatch, source, format=None):
+    """Show a video, and return the last pair, the number of frames, and what was told."""
+    told, tally, composed = [], LiveTally(), []
+    with Screen(0) as screen, Capture([str(source)], format=format) as capture:
+        monkeypatch.setattr(
+            "stereoweave.app.live.compose", lambda pair, *more: composed.append(pair) or compose(pair, *more)
+        )
+        show(capture, screen, Matcher(), tally, format=format, tell=told.append)
+    return composed[-1], tally.last + 1, " ".join(map(str, told))
+
+
+def assert_views(pair, left, right):
+    for eye, expected in ((pair.left, left), (pair.right, right)):
+        assert np.abs(eye.astype(int) - expected).mean() < 7
+
+
+@pytest.mark.parametrize("format", [None, "two_streams"])
+def test_two_streams_of_a_file_are_shown_as_a_pair(tmp_path, monkeypatch, format):
+    pairs = example_pairs(3)
+    path = write_streams(tmp_path / "a.avi", *zip(*pairs, strict=True))
+    pair, count, told = last_pair(monkeypatch, path, format)
+    assert_views(pair, *pairs[-1])
+    assert count == 3
+    assert "two video streams of the same size and rate" in told
+
+
+def test_frames_in_turn_are_shown_as_pairs(tmp_path, monkeypatch):
+    pairs = example_pairs(3)
+    in_turn = [eye for pair in pairs for eye in pair]
+    plain = video_examples.write_video(tmp_path / "plain.mp4", in_turn, codec="libx264")
+    pair, count, _ = last_pair(monkeypatch, plain, "frame_sequential")
+    assert_views(pair, *pairs[-1])
+    assert count == 3
+    options = {"x264-params": "frame-packing=5", "g": "1"}
+    declared = video_examples.write_video(tmp_path / "b.mp4", in_turn, codec="libx264", options=options)
+    pair, count, told = last_pair(monkeypatch, declared)
+    assert_views(pair, *pairs[-1])
+    assert count == 3
+    assert "frame_sequential, as the file declares" in told
+
+
+def test_views_apart_are_read_from_a_single_file_only(tmp_path):
+    with pytest.raises(
+        FormatError, match="^0: expected a video file .* two_streams, found another"
+    ) as caught:
+        Capture(["0"], format="two_streams")
+    assert str(caught.value).endswith("; convert it to side_by_side first (video)")
+    pairs = example_pairs(2)
+    twins = str(write_streams(tmp_path / "a.avi", *zip(*pairs, strict=True)))
+    with pytest.raises(FormatError, match=r"found a video \(two_streams\) with both views; give it alone"):
+        Capture([twins, write_video(tmp_path / "b.avi", greys(2))])
+    with pytest.raises(FormatError, match="expected two video streams of the same size and rate, found 1"):
+        Capture([write_video(tmp_path / "c.avi", greys(2))], format="two_streams")
 
 
 def test_the_command_shows_a_video_and_keeps_its_last_picture(tmp_path):

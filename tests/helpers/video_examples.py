@@ -154,6 +154,36 @@ def write_video(
     return path
 
 
+def write_streams(
+    path: Path,
+    *streams: Sequence[np.ndarray],
+    codec: str = "mjpeg",
+    rates: Sequence[int] | None = None,
+    sound: bool = False,
+) -> Path:
+    """Write a video with a stream for each list of frames, as Fujifilm's cameras do: one after the other."""
+    with av.open(str(path), "w") as container:
+        for index, frames in enumerate(streams):
+            stream = container.add_stream(codec, rate=rates[index] if rates else 25)
+            stream.height, stream.width = frames[0].shape[:2]
+            stream.pix_fmt = {"mjpeg": "yuvj422p", "ffv1": "bgr0"}.get(codec, "yuv420p")
+            stream.codec_context.qmax = 2
+        track = container.add_stream("pcm_s16le", rate=8000) if sound else None
+        for number in range(max(map(len, streams))):
+            for index, (stream, frames) in enumerate(zip(container.streams.video, streams, strict=True)):
+                if number < len(frames):
+                    frame = av.VideoFrame.from_ndarray(frames[number], "rgb24")
+                    frame.pts, frame.time_base = number, Fraction(1, rates[index] if rates else 25)
+                    container.mux(stream.encode(frame))
+        for stream in container.streams.video:
+            container.mux(stream.encode())
+        if track:
+            wave = av.AudioFrame.from_ndarray(np.zeros((1, 8000), np.int16), format="s16", layout="mono")
+            wave.pts, wave.rate, wave.time_base = 0, 8000, Fraction(1, 8000)
+            container.mux([*track.encode(wave), *track.encode()])
+    return path
+
+
 def packets(path: Path, kind: str) -> list[tuple[int, bytes]]:
     """Return the time stamp and content of each packet of a kind, "video" or "audio"."""
     with av.open(str(path)) as container:

@@ -5,34 +5,10 @@ import numpy as np
 import pytest
 from matroska_examples import block, matroska, stereo_track, video_track
 from opened_videos import assert_eyes, refusal_by_name
-from video_examples import FRAME_MS, damage, example_pairs, flat_pairs, truncate, write_video
+from video_examples import FRAME_MS, damage, example_pairs, flat_pairs, truncate, write_streams, write_video
 
 from stereoweave.errors import FormatError
 from stereoweave.video.reader import open_video
-
-
-def write_streams(path, *streams, codec="mjpeg", rates=None, sound=False):
-    """Write a video with a stream for each list of frames, as Fujifilm's cameras do: one after the other."""
-    with av.open(str(path), "w") as container:
-        for index, frames in enumerate(streams):
-            stream = container.add_stream(codec, rate=rates[index] if rates else 25)
-            stream.height, stream.width = frames[0].shape[:2]
-            stream.pix_fmt = {"mjpeg": "yuvj422p", "ffv1": "bgr0"}.get(codec, "yuv420p")
-            stream.codec_context.qmax = 2
-        track = container.add_stream("pcm_s16le", rate=8000) if sound else None
-        for number in range(max(map(len, streams))):
-            for index, (stream, frames) in enumerate(zip(container.streams.video, streams, strict=True)):
-                if number < len(frames):
-                    frame = av.VideoFrame.from_ndarray(frames[number], "rgb24")
-                    frame.pts, frame.time_base = number, Fraction(1, rates[index] if rates else 25)
-                    container.mux(stream.encode(frame))
-        for stream in container.streams.video:
-            container.mux(stream.encode())
-        if track:
-            wave = av.AudioFrame.from_ndarray(np.zeros((1, 8000), np.int16), format="s16", layout="mono")
-            wave.pts, wave.rate, wave.time_base = 0, 8000, Fraction(1, 8000)
-            container.mux([*track.encode(wave), *track.encode()])
-    return path
 
 
 def split(pairs):
