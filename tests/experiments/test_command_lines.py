@@ -17,6 +17,7 @@ EXPERIMENTS = (
     "ablations",
     "first_run",
     "handheld",
+    "interleaved",
     "paper",
     "speed",
     "stage_costs",
