@@ -20,6 +20,7 @@ EXPERIMENTS = (
     "interleaved",
     "paper",
     "speed",
+    "sphere_windows",
     "stage_costs",
     "video_speed",
     "whole_films",
