@@ -14,7 +14,7 @@ from stereoweave.pictures.anaglyphs import MOVED_SHARE, extract_detail, measure_
 _BETWEEN = np.array([-1, 0, 9, 0, 9, 0, -1], np.float32) / 16
 _REACH = len(_BETWEEN) // 2
 # At this size, 10 of 12 real pairs are suspected if interleaved by rows or as a checkerboard, 11 if by
-# columns; none of their 24 pictures is, nor are 12 others.
+# columns; none of their 24 pictures is (`python -m experiments.interleaved`).
 _LONGER_SIDE_PX = 320
 
 

@@ -34,7 +34,7 @@ from stereoweave.service.folders import make_own_folder
 from stereoweave.service.replica_processes import ReplicaProcesses, TimedJob
 from stereoweave.service.server import ClientTimeouts, run_http_server
 from stereoweave.system.child_process import ProcessDiedError
-from stereoweave.system.ray_engine import Engine, call_on_each_machine, connect, count_slots
+from stereoweave.system.ray_engine import Engine, call_on_each_machine, connect, count_cores, count_slots
 from stereoweave.system.threads import usable_cores
 
 NAME = "stereoweave"
@@ -325,7 +325,7 @@ def _check_slots(settings: Settings, found: int) -> None:
     if settings.replicas > found:
         gpu = " and a GPU" if settings.gpus_each else ""
         raise StereoweaveError(
-            f"expected at most {found}, because each takes {settings.threads} cores{gpu}, "
+            f"expected at most {found}, because each takes {count_cores(settings.threads)}{gpu}, "
             f"found {settings.replicas}",
             setting="replicas",
             remedy=Remedy("use lower values", ("replicas", "threads")),

@@ -286,11 +286,17 @@ def count_slots(engine: Engine) -> int:
     if slots := _count_slots(engine):
         return slots
     largest = max(_list_machines().values(), key=lambda resources: resources.get("CPU", 0))
+    gpus = "1 GPU" if engine.gpus_each == 1 else f"{engine.gpus_each:g} GPUs"
     raise StereoweaveError(
-        f"expected a machine with {engine.cpus_each:g} cores and {engine.gpus_each:g} GPUs for a worker, "
+        f"expected a machine with {count_cores(engine.cpus_each)} and {gpus} for a worker, "
         f"found {largest.get('CPU', 0):g} and {largest.get('GPU', 0):g} on the largest; add a larger machine",
         remedy=Remedy("or use lower values", ("cpus_each", "gpus_each")),
     )
+
+
+def count_cores(cores: float) -> str:
+    """Return a number of cores in words."""
+    return "1 core" if cores == 1 else f"{cores:g} cores"
 
 
 def _count_slots(engine: Engine) -> int:

@@ -446,8 +446,11 @@ def test_frames_in_turn_are_shown_as_pairs(tmp_path, monkeypatch):
 
 
 def test_views_apart_are_read_from_a_single_file_only(tmp_path):
-    with pytest.raises(FormatError, match="^0: expected a video file for the frame packing two_streams"):
+    with pytest.raises(
+        FormatError, match="^0: expected a video file .* two_streams, found another"
+    ) as caught:
         Capture(["0"], format="two_streams")
+    assert str(caught.value).endswith("; convert it to side_by_side first (video)")
     pairs = example_pairs(2)
     twins = str(write_streams(tmp_path / "a.avi", *zip(*pairs, strict=True)))
     with pytest.raises(FormatError, match=r"found a video \(two_streams\) with both views; give it alone"):

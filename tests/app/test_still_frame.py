@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from PIL import Image
 from spatial_examples import SPATIAL
-from sphere_scenes import render_turning
 from video_examples import example_pairs, flat_pairs, packed, truncate, write_side_by_side, write_video
 
+from experiments.sphere_windows.room import render_turning
 from stereoweave.app.still_frame import convert_still
 from stereoweave.app.video_tab import label_of
 from stereoweave.app.video_upload import VideoUpload

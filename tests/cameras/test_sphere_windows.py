@@ -4,8 +4,14 @@ import av
 import cv2
 import numpy as np
 import pytest
-from sphere_scenes import cast, look_equirectangular, look_fisheye, render_fixed, render_turning
 
+from experiments.sphere_windows.room import (
+    cast,
+    look_equirectangular,
+    look_fisheye,
+    render_fixed,
+    render_turning,
+)
 from stereoweave.cameras.sphere_remap import Cutter, Spreader
 from stereoweave.cameras.sphere_windows import make_whole_window, make_window
 from stereoweave.cameras.spherical import Projection, SphereRequest

@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
-from sphere_scenes import cast, look_equirectangular, render_fixed, render_turning
 
+from experiments.sphere_windows.room import cast, look_equirectangular, render_fixed, render_turning
 from stereoweave.cameras.sphere_nearness import MatchedWindow, spread_nearness
 from stereoweave.cameras.sphere_windows import make_whole_window, make_window
 from stereoweave.cameras.spherical import Projection, SphereRequest

@@ -3,10 +3,10 @@ import base64
 import numpy as np
 import pytest
 from PIL import Image
-from sphere_scenes import look_equirectangular, look_fisheye, render_fixed, render_turning
 from vr180_examples import embed, encode_jpeg, make_extension, make_gpano, make_vr180
 
 import stereoweave as sw
+from experiments.sphere_windows.room import look_equirectangular, look_fisheye, render_fixed, render_turning
 from stereoweave.cameras.alignment import check_pair
 from stereoweave.cameras.spherical import SphereRequest
 from stereoweave.errors import StereoweaveError

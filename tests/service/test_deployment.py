@@ -358,12 +358,19 @@ def test_invalid_settings_are_reported_before_ray_starts(words, expected, capsys
     assert printed.count("\n") == 1
 
 
-def test_a_cluster_without_room_is_reported_at_once(ray_address, capsys):
-    assert main(["serve", "--port", "0", "--address", ray_address, "--threads", "3"]) == 2
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        (["--threads", "3"], "at most 0, because each takes 3 cores, found 1"),
+        (["--threads", "1", "--replicas", "9"], "at most 2, because each takes 1 core, found 9"),
+    ],
+    ids=["large", "many"],
+)
+def test_a_cluster_without_room_is_reported_at_once(ray_address, capsys, words, found):
+    assert main(["serve", "--port", "0", "--address", ray_address, *words]) == 2
     printed = capsys.readouterr().err
     assert printed == (
-        "stereoweave: --replicas: expected at most 0, because each takes 3 cores, found 1; "
-        "use lower values (--replicas, --threads)\n"
+        f"stereoweave: --replicas: expected {found}; use lower values (--replicas, --threads)\n"
     )
 
 

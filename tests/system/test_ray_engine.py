@@ -139,7 +139,7 @@ def test_a_worker_too_large_for_every_machine_is_refused_and_fractions_of_cores_
         list(stream(make_reporter, [1], Engine(cpus_each=3)))
     with pytest.raises(
         StereoweaveError,
-        match=r"a machine with 1 cores and 0.5 GPUs .* found 2 and 0 .*; or use lower values "
+        match=r"a machine with 1 core and 0.5 GPUs .* found 2 and 0 .*; or use lower values "
         r"\(cpus_each, gpus_each\)$",
     ):
         count_slots(Engine(gpus_each=0.5))

@@ -9,9 +9,9 @@ import pytest
 from conversions import frames_of, times_of
 from rich.console import Console
 from spatial_examples import box, psnr_db, with_boxes
-from sphere_scenes import look_equirectangular, look_fisheye, render_fixed, render_turning
 from video_examples import write_side_by_side
 
+from experiments.sphere_windows.room import look_equirectangular, look_fisheye, render_fixed, render_turning
 from stereoweave.cameras.alignment import check_pair
 from stereoweave.cameras.spherical import Projection, SphereRequest
 from stereoweave.cli.root import main

@@ -1,0 +1,1 @@
+"""How many interleaved pictures are suspected, and how many ordinary ones."""
