@@ -136,6 +136,25 @@ def test_run_times_are_written_one_row_per_network(folder, monkeypatch, capfd):
     assert capfd.readouterr().out.endswith("rows: speed.csv\n")
 
 
+def test_scores_by_world_are_written_and_printed_by_split(folder, monkeypatch, capfd):
+    from experiments.paper_worlds import scoring
+
+    numbers = dict.fromkeys(scoring.WorldsRow.__annotations__, 2.5) | {"method": "tiny", "steps": 7}
+    rows = [
+        scoring.WorldsRow(**numbers | {"split": split, "pairs": pairs})
+        for split, pairs in (("random", 3), ("disjoint", 5))
+    ]
+    monkeypatch.setattr(scoring, "score_worlds", lambda runs, most: iter(rows))
+    assert run("paper_worlds tiny.pt") == 0
+    assert [(row["split"], row["epe_cm"]) for row in read_rows("worlds.csv")] == [
+        ("random", "2.5"),
+        ("disjoint", "2.5"),
+    ]
+    printed = capfd.readouterr().out
+    assert "split random, 3 pairs" in printed and "split disjoint, 5 pairs" in printed
+    assert printed.endswith("rows: worlds.csv\n")
+
+
 @pytest.mark.parametrize(
     ("option", "claims"),
     [("", CLAIMS), ("--exponent-only", ("depth adjustment",))],
