@@ -9,7 +9,9 @@ import typer
 
 from experiments.command_line import run
 from stereoweave.cli.options import make_parent_folder, require_train_extra
-from stereoweave.cli.tables import write_and_print
+from stereoweave.cli.tables import print_means
+
+_COLUMNS = {"EPE cm": "epe_cm", "deviation": "epe_cm_sd", "EPE px": "epe_px", "MAE of the view": "mae_filled"}
 
 
 def paper_worlds(
@@ -22,10 +24,17 @@ def paper_worlds(
     ] = None,
 ) -> None:
     """Score networks in the worlds that they trained on and in others, beside the nearest training frame."""
+    from stereoweave.bench.tables import write_csv
+
     make_parent_folder(out)
     with require_train_extra():
         from experiments.paper_worlds.scoring import score_worlds
-    write_and_print(out, "Held-out frames of a set by world", list(score_worlds(runs, most)))
+    rows = list(score_worlds(runs, most))
+    write_csv(out, rows)
+    for split in dict.fromkeys(row.split for row in rows):
+        chosen = [row for row in rows if row.split == split]
+        print_means({f"split {split}, {chosen[0].pairs} pairs": _COLUMNS}, "method", chosen)
+    typer.echo(f"rows: {out}")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

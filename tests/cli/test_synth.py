@@ -11,6 +11,8 @@ from shard_examples import contents
 
 from stereoweave.cli.root import main
 from stereoweave.cli.synth import SCENE_NAMES
+from stereoweave.data.poses import read_poses
+from stereoweave.data.readers import open_dataset
 from stereoweave.data.shards import Shards
 from stereoweave.synth.rendering.gpu_buffers import FrameBuffers
 from stereoweave.synth.scenes import SCENES
@@ -44,6 +46,18 @@ def test_a_set_is_made_once(words, capsys):
     assert contents(out) == before
     assert Shards(out)[1].left.shape == (120, 160, 3)
     assert list(Shards(out).views(1)) == [0.5]
+
+
+@pytest.mark.needs_egl
+def test_a_set_by_world_has_a_video_of_each_world_and_passes_the_check(tmp_path, capsys):
+    out = tmp_path / "set"
+    line = f"synth make ship --worlds 2 --frames 2 --size 160x120 --plain --layout paper --jobs 1 -o {out}"
+    assert run(line) == 0
+    assert f"{out}: 4 pairs made, 0 already there" in capsys.readouterr().out
+    names = [f"ship/{world}/00000{frame}" for world in ("000", "001") for frame in (0, 1)]
+    assert [frame.name for frame in open_dataset("paper_worlds", out)] == names
+    assert list(read_poses(out)) == names
+    assert run(f"synth check {out} --jobs 1") == 0
 
 
 @pytest.mark.needs_egl

@@ -19,6 +19,8 @@ EXPERIMENTS = (
     "handheld",
     "interleaved",
     "paper",
+    "paper_sets",
+    "paper_worlds",
     "speed",
     "sphere_windows",
     "stage_costs",
@@ -63,6 +65,10 @@ def folder(tmp_path, monkeypatch):
         (f"paper {RECIPE} -o runs --report report --exponent-only --jobs 0", ["--jobs"]),
         ("ablations none.toml -o runs --report rows.csv", ["none.toml", "expected a recipe"]),
         ("stage_costs none.pt -o rows.csv", ["none.pt", "no such checkpoint"]),
+        ("paper_worlds none.pt -o rows.csv", ["none.pt", "no such checkpoint"]),
+        ("paper_worlds -o rows.csv", ["RUN...", "--help"]),
+        ("paper_sets", ["--report", "--help"]),
+        ("paper_sets --report rows --size big", ["--size: expected width x height"]),
         ("whole_films none.mp4 -o rows.csv", ["none.mp4", "no such"]),
         (
             "whole_films none.mp4 -o rows.csv --output hologram",
@@ -130,6 +136,25 @@ def test_run_times_are_written_one_row_per_network(folder, monkeypatch, capfd):
         "400",
     )
     assert capfd.readouterr().out.endswith("rows: speed.csv\n")
+
+
+def test_scores_by_world_are_written_and_printed_by_split(folder, monkeypatch, capfd):
+    from experiments.paper_worlds import scoring
+
+    numbers = dict.fromkeys(scoring.WorldsRow.__annotations__, 2.5) | {"method": "tiny", "steps": 7}
+    rows = [
+        scoring.WorldsRow(**numbers | {"split": split, "pairs": pairs})
+        for split, pairs in (("random", 3), ("disjoint", 5))
+    ]
+    monkeypatch.setattr(scoring, "score_worlds", lambda runs, most: iter(rows))
+    assert run("paper_worlds tiny.pt") == 0
+    assert [(row["split"], row["epe_cm"]) for row in read_rows("worlds.csv")] == [
+        ("random", "2.5"),
+        ("disjoint", "2.5"),
+    ]
+    printed = capfd.readouterr().out
+    assert "split random, 3 pairs" in printed and "split disjoint, 5 pairs" in printed
+    assert printed.endswith("rows: worlds.csv\n")
 
 
 @pytest.mark.parametrize(
