@@ -68,6 +68,6 @@ def test_an_unknown_matcher_is_reported_in_one_line_before_anything_is_measured(
     printed, told = capfd.readouterr()
     assert printed == ""
     assert told.strip().splitlines() == [
-        "Error: --matchers: expected adaptive_window, dynamic_programming, 3dmst, found 'words'"
+        "stereoweave: --matchers: expected adaptive_window, dynamic_programming, 3dmst, found 'words'"
     ]
     assert not Path("pairs.csv").exists()
