@@ -94,7 +94,7 @@ def test_3dmst_finds_a_plain_box_before_a_wall_up_to_its_edges(rng):
     # The box hides the wall left of it from the right camera: columns 44 to 59 are holes.
     seen = ~inside
     seen[:, :8] = seen[15:45, 44:60] = False
-    assert (abs(found_px[seen] - 4) < 1).mean() > 0.98
+    assert (abs(found_px[seen] - 4) < 1).mean() > 0.95
     assert (found_px[17:43, 46:58] == -1).mean() > 0.8
 
 
