@@ -130,7 +130,9 @@ def pairs(  # noqa: PLR0913 - each is an option of the command line
     engine = make_engine(cluster, cpus_each=threads or 1)
     threads = engine.threads_each if engine else threads
     cv2.setNumThreads(thread_count(threads))
-    makers = {name: partial(make_classical_matcher, name) for name in matchers or ()}
+    makers: dict[str, Callable[[], Any]] = {
+        name: partial(make_classical_matcher, name) for name in matchers or ()
+    }
     makers |= _list_mc_cnns(mc_cnn or [], threads)
     if model or not makers:
         makers |= _list_makers(model, threads, provider)

@@ -14,7 +14,7 @@ from stereoweave.bench.classical.costs import CostFunction, match_census_and_col
 from stereoweave.bench.classical.windows import find_window_costs
 from stereoweave.stereo import StereoPair
 
-OCCLUSION_COST = 12.0
+OCCLUSION_COST = 20.0
 """Cost of a pixel without a match, in the unit of the matching costs."""
 
 

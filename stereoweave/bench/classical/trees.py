@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Int, Int32, UInt8
 
-SIGMA_LEVELS = 25.5
-"""Colour difference at which the similarity of two neighbours falls to 1/e: Yang's 0.1 of 255 levels."""
+SIGMA_LEVELS = 12.0
+"""Colour difference at which the similarity of two neighbours falls to 1/e; 25.5 in Yang's paper."""
 SPREAD, LEAST_PIXELS, MOST_PIXELS = 2000.0, 100, 5000
 
 

@@ -24,8 +24,8 @@ from stereoweave.bench.classical.costs import (
 from stereoweave.stereo import StereoPair
 
 RADII_PX = (2, 4, 7, 12)
-VARIANCE_WEIGHT = 0.05
-PENALTY, PENALTY_OFFSET_PX = 40.0, -2.0
+VARIANCE_WEIGHT = 0.1
+PENALTY, PENALTY_OFFSET_PX = 10.0, -2.0
 
 
 def find_window_costs(costs: UInt8[np.ndarray, "h w d"]) -> UInt16[np.ndarray, "h w d"]:

@@ -42,24 +42,37 @@ def scenes(dots, tmp_path):
     return scene.parent
 
 
-def test_bench_pairs_scores_named_matchers_beside_opencv_s_and_no_network(scenes, tmp_path, capfd):
+def test_bench_pairs_scores_a_named_matcher_beside_opencv_s(scenes, tmp_path, capfd):
     rows = tmp_path / "rows.csv"
-    command = f"bench pairs {scenes} --matchers 3dmst --matchers adaptive_window -o {rows}"
-    assert main([*command.split(), "--sparsification", f"{tmp_path}/curves.png"]) == 0
+    options = f"--matchers dynamic_programming -o {rows} --sparsification {tmp_path}/curves.png"
+    assert main(["bench", "pairs", str(scenes), *options.split()]) == 0
     with rows.open() as file:
         found = {row["matcher"]: row for row in csv.DictReader(file) if row["scene"] == "mean"}
-    assert list(found) == [*OPENCV_MATCHERS, "3dmst", "adaptive_window"]
-    assert float(found["3dmst"]["bad2_percent"]) < 10
-    assert "3dmst" in capfd.readouterr().out
+    assert list(found) == [*OPENCV_MATCHERS, "dynamic_programming"]
+    assert float(found["dynamic_programming"]["bad2_percent"]) < 10
+    assert "dynamic_programming" in capfd.readouterr().out
 
 
-def test_bench_pairs_scores_a_network_too_if_it_is_named(scenes, tmp_path):
-    rows = tmp_path / "rows.csv"
-    command = f"bench pairs {scenes} --matchers dynamic_programming --model small -o {rows}"
-    assert main(command.split()) == 0
-    with rows.open() as file:
-        found = {row["matcher"] for row in csv.DictReader(file)}
-    assert found == {*OPENCV_MATCHERS, "dynamic_programming", "small", "small refined"}
+@pytest.mark.parametrize(
+    ("options", "scored"),
+    [
+        ("--matchers 3dmst --matchers adaptive_window", ["3dmst", "adaptive_window"]),
+        ("--matchers 3dmst --model small", ["3dmst", "small", "small refined"]),
+        ("--model small", ["small", "small refined"]),
+    ],
+)
+def test_networks_are_scored_beside_named_matchers_only_if_they_are_named(
+    scenes, monkeypatch, options, scored
+):
+    makers = []
+
+    def stop(given, *_):
+        makers.extend(given)
+        raise StereoweaveError("enough")
+
+    monkeypatch.setattr("stereoweave.bench.pairs.score_pairs", stop)
+    assert main(f"bench pairs {scenes} {options} -o {scenes}/rows.csv".split()) == 2
+    assert makers == scored
 
 
 def test_an_unknown_matcher_is_reported_in_one_line_before_anything_is_measured(scenes, capfd, monkeypatch):
@@ -68,6 +81,6 @@ def test_an_unknown_matcher_is_reported_in_one_line_before_anything_is_measured(
     printed, told = capfd.readouterr()
     assert printed == ""
     assert told.strip().splitlines() == [
-        "Error: --matchers: expected adaptive_window, dynamic_programming, 3dmst, found 'words'"
+        "stereoweave: --matchers: expected adaptive_window, dynamic_programming, 3dmst, found 'words'"
     ]
     assert not Path("pairs.csv").exists()

@@ -32,14 +32,14 @@ def test_windows_stop_at_an_edge_of_depth():
     costs[:, 40:, 0] = costs[:, :40, 1] = 64
     found = find_window_costs(costs)
     np.testing.assert_array_equal(found.argmin(-1), np.broadcast_to(np.arange(80) >= 40, (60, 80)))
-    # A window of 25x25 fits on either side of the edge, beside it too: its penalty is 40 / (25 - 2).
-    assert (found.min(-1) == int(32 * 40 / 23)).all()
+    # A window of 25x25 fits on either side of the edge, beside it too: its penalty is 10 / (25 - 2).
+    assert (found.min(-1) == int(32 * 10 / 23)).all()
 
 
 def test_a_large_window_wins_on_a_plain_surface_and_a_small_one_at_a_detail():
     costs = np.full((61, 61, 1), 30, np.uint8)
     costs[28:33, 28:33] = 0
     found = find_window_costs(costs)
-    # 30 + 40 / 23 far away; 0 + 40 / 3 for the window of 5x5 that is the detail.
-    assert found[5, 5, 0] == int(32 * (30 + 40 / 23))
-    assert found[30, 30, 0] == int(32 * 40 / 3)
+    # 30 + 10 / 23 far away; 0 + 10 / 3 for the window of 5x5 that is the detail.
+    assert found[5, 5, 0] == int(32 * (30 + 10 / 23))
+    assert found[30, 30, 0] == int(32 * 10 / 3)
