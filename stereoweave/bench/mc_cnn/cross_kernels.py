@@ -55,18 +55,18 @@ def find_arms(grey, distance, intensity, arms):
 def sum_rows(costs, own, other, before, sums):
     """Write the sum of the costs along the horizontal arms that both views share.
 
-    own and other are the arms of both views; the columns of other are reversed. before, float64 [W + 1, D],
+    own and other are the arms of both views; the columns of other are reversed. before, float64 [(W + 1) D],
     is overwritten.
     """
     height, width, count = costs.shape
-    before[0] = 0
-    flat = before.ravel()
+    for d in range(count):
+        before[d] = 0
     for y in range(height):
         for x in range(width):
-            inside = min(x + 1, count)
-            before[x + 1, inside:] = before[x, inside:]
-            for d in range(inside):
-                before[x + 1, d] = before[x, d] + costs[y, x, d]
+            inside, start = min(x + 1, count), x * count
+            for d in range(count):
+                cost = costs[y, x, d] if d < inside else 0
+                before[start + count + d] = before[start + d] + cost
         for x in range(width):
             inside, match = min(x + 1, count), width - 1 - x
             left, right = own[_LEFT, y, x], own[_RIGHT, y, x]
@@ -74,7 +74,7 @@ def sum_rows(costs, own, other, before, sums):
             out = sums[y, x, :inside]
             for d in range(inside):
                 first, end = x - min(left, lefts[d]), x + min(right, rights[d]) + 1
-                out[d] = flat[np.uint32(end * count + d)] - flat[np.uint32(first * count + d)]
+                out[d] = before[np.uint32(end * count + d)] - before[np.uint32(first * count + d)]
 
 
 @kernel
@@ -82,21 +82,21 @@ def sum_rows(costs, own, other, before, sums):
 def sum_columns(sums, own, other, before, costs):
     """Write the sum over the shared region, given the sums of its rows. Costs outside stay.
 
-    before, float64 [H + 1, D], is overwritten.
+    before, float64 [(H + 1) D], is overwritten.
     """
     height, width, count = costs.shape
-    before[0] = 0
-    flat = before.ravel()
+    for d in range(count):
+        before[d] = 0
     for x in range(width):
         inside, match = min(x + 1, count), width - 1 - x
         for y in range(height):
-            here = sums[y, x, :inside]
+            here, start = sums[y, x, :inside], y * count
             for d in range(inside):
-                before[y + 1, d] = before[y, d] + here[d]
+                before[start + count + d] = before[start + d] + here[d]
         for y in range(height):
             up, down = own[_UP, y, x], own[_DOWN, y, x]
             ups, downs = other[_UP, y, match : match + inside], other[_DOWN, y, match : match + inside]
             out = costs[y, x, :inside]
             for d in range(inside):
                 first, end = y - min(up, ups[d]), y + min(down, downs[d]) + 1
-                out[d] = flat[np.uint32(end * count + d)] - flat[np.uint32(first * count + d)]
+                out[d] = before[np.uint32(end * count + d)] - before[np.uint32(first * count + d)]
