@@ -121,6 +121,7 @@ def _simplify(module: Any) -> None:
 def _compile() -> Iterator[Any]:
     """Compile all kernels by Numba, and yield them."""
     from stereoweave.bench.classical.matchers import rehearse_classical_matchers
+    from stereoweave.bench.mc_cnn.steps import rehearse_mc_cnn
     from stereoweave.matching.edge_vote.vote import rehearse_voting
     from stereoweave.matching.refine import rehearse_refining
     from stereoweave.matching.upsample import rehearse_upsampling
@@ -128,9 +129,9 @@ def _compile() -> Iterator[Any]:
     from stereoweave.system.jit import Kernel
     from stereoweave.video.carried_frames import rehearse_carrying
 
-    for rehearse in (rehearse_refining, rehearse_voting, rehearse_upsampling, rehearse_carrying):
-        rehearse()
-    for rehearse in (rehearse_drawing, rehearse_filling, rehearse_moving, rehearse_classical_matchers):
+    matching = rehearse_refining, rehearse_voting, rehearse_upsampling, rehearse_carrying
+    rendering = rehearse_drawing, rehearse_filling, rehearse_moving
+    for rehearse in (*matching, *rendering, rehearse_classical_matchers, rehearse_mc_cnn):
         rehearse()
     for name, module in sorted(sys.modules.items()):
         if name.startswith("stereoweave.") and name.endswith("_kernels"):

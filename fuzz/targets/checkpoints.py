@@ -1,12 +1,13 @@
-"""Training checkpoints."""
+"""Training checkpoints, and files with the weights of MC-CNN."""
 
 from functools import partial
 from pathlib import Path
 
 import torch
 
-from fuzz.targets import Target, write_to_bytes
+from fuzz.targets import Target, read_every_way, write_to_bytes
 from stereoweave.learn.checkpoint import Checkpoint, load, save
+from stereoweave.learn.models.mc_cnn import load_weights
 from stereoweave.learn.recipe import parse_recipe
 
 _RECIPE = {
@@ -32,7 +33,7 @@ def _starts() -> dict[str, bytes]:
 
 
 def _read(path: Path) -> None:
-    load(path)
+    read_every_way(partial(load, path), partial(load_weights, path))
 
 
 TARGET = Target(

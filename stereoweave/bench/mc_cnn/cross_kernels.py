@@ -2,7 +2,8 @@
 
 The plain reference implementation is tests/helpers/plain_mc_cnn.py. A pixel's region is the rows of the
 pixels in its column that its vertical arms reach, each as far as that pixel's horizontal arms reach. Costs
-are averaged over what the region shares with that of the match: its arms are the shorter ones of both.
+are averaged over what the region shares with that of the match: its arms are the shorter ones of both. Sums
+along an arm are differences of sums from the border.
 """
 
 import typing
@@ -51,42 +52,51 @@ def find_arms(grey, distance, intensity, arms):
 
 @kernel
 @typing.no_type_check
-def sum_rows(costs, own, other, sums):
+def sum_rows(costs, own, other, before, sums):
     """Write the sum of the costs along the horizontal arms that both views share.
 
-    own and other are the arms of both views.
+    own and other are the arms of both views; the columns of other are reversed. before, float64 [(W + 1) D],
+    is overwritten.
     """
     height, width, count = costs.shape
-    before = np.zeros((width + 1, count))
+    for d in range(count):
+        before[d] = 0
     for y in range(height):
         for x in range(width):
-            inside = min(x + 1, count)
-            for d in range(inside):
-                before[x + 1, d] = before[x, d] + costs[y, x, d]
+            inside, start = min(x + 1, count), x * count
+            for d in range(count):
+                cost = costs[y, x, d] if d < inside else 0
+                before[start + count + d] = before[start + d] + cost
         for x in range(width):
-            for d in range(min(x + 1, count)):
-                first = x - min(own[_LEFT, y, x], other[_LEFT, y, x - d])
-                last = x + min(own[_RIGHT, y, x], other[_RIGHT, y, x - d])
-                sums[y, x, d] = before[last + 1, d] - before[first, d]
+            inside, match = min(x + 1, count), width - 1 - x
+            left, right = own[_LEFT, y, x], own[_RIGHT, y, x]
+            lefts, rights = other[_LEFT, y, match : match + inside], other[_RIGHT, y, match : match + inside]
+            out = sums[y, x, :inside]
+            for d in range(inside):
+                first, end = x - min(left, lefts[d]), x + min(right, rights[d]) + 1
+                out[d] = before[np.uint32(end * count + d)] - before[np.uint32(first * count + d)]
 
 
 @kernel
 @typing.no_type_check
-def average_columns(sums, own, other, costs):
-    """Write the mean cost over the shared region, given the sums of its rows. Costs outside stay."""
+def sum_columns(sums, own, other, before, costs):
+    """Write the sum over the shared region, given the sums of its rows. Costs outside stay.
+
+    before, float64 [(H + 1) D], is overwritten.
+    """
     height, width, count = costs.shape
-    before, sizes = np.zeros((height + 1, count)), np.zeros((height + 1, count), np.int32)
+    for d in range(count):
+        before[d] = 0
     for x in range(width):
-        inside = min(x + 1, count)
+        inside, match = min(x + 1, count), width - 1 - x
         for y in range(height):
+            here, start = sums[y, x, :inside], y * count
             for d in range(inside):
-                left = min(own[_LEFT, y, x], other[_LEFT, y, x - d])
-                right = min(own[_RIGHT, y, x], other[_RIGHT, y, x - d])
-                before[y + 1, d] = before[y, d] + sums[y, x, d]
-                sizes[y + 1, d] = sizes[y, d] + left + 1 + right
+                before[start + count + d] = before[start + d] + here[d]
         for y in range(height):
+            up, down = own[_UP, y, x], own[_DOWN, y, x]
+            ups, downs = other[_UP, y, match : match + inside], other[_DOWN, y, match : match + inside]
+            out = costs[y, x, :inside]
             for d in range(inside):
-                first = y - min(own[_UP, y, x], other[_UP, y, x - d])
-                last = y + min(own[_DOWN, y, x], other[_DOWN, y, x - d])
-                area = sizes[last + 1, d] - sizes[first, d]
-                costs[y, x, d] = (before[last + 1, d] - before[first, d]) / area
+                first, end = y - min(up, ups[d]), y + min(down, downs[d]) + 1
+                out[d] = before[np.uint32(end * count + d)] - before[np.uint32(first * count + d)]

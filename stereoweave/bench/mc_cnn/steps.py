@@ -123,11 +123,15 @@ def aggregate(costs: Costs, left: Grey, right: Grey, settings: StereoSettings, t
     """Replace the costs by their means over cross-shaped regions, several times."""
     if not times:
         return
-    own, other = (_find_arms(grey, settings) for grey in (left, right))
-    sums = np.empty_like(costs)
-    for _ in range(times):
-        cross.sum_rows(costs, own, other, sums)
-        cross.average_columns(sums, own, other, costs)
+    arms = _find_arms(left, settings), np.ascontiguousarray(_find_arms(right, settings)[..., ::-1])
+    height, width, count = costs.shape
+    sums, areas = np.empty_like(costs), np.ones_like(costs)
+    along_rows, along_columns = np.empty((width + 1) * count), np.empty((height + 1) * count)
+    for volume in (areas, *times * [costs]):
+        cross.sum_rows(volume, *arms, along_rows, sums)
+        cross.sum_columns(sums, *arms, along_columns, volume)
+        if volume is costs:
+            costs /= areas
 
 
 def sum_paths(costs: Costs, left: Grey, right: Grey, settings: StereoSettings) -> Costs:
@@ -166,6 +170,12 @@ def smooth(disparity_px: Float32[np.ndarray, "h w"], settings: StereoSettings) -
     smoothed_px = np.empty_like(disparity_px)
     refinement.smooth(disparity_px, weights.astype(np.float32), settings.blur_step_px, smoothed_px)
     return smoothed_px
+
+
+def rehearse_mc_cnn() -> None:
+    """Find the disparity of a small pair, to compile all kernels (`release.kernels`)."""
+    view = DescribedView(grey=np.zeros((8, 12), np.float32), vectors=np.zeros((8, 12, 2), np.float32))
+    find_disparity(view, view, 4, AGGREGATED)
 
 
 def _compare(left: DescribedView, right: DescribedView, candidates: int) -> Costs:
