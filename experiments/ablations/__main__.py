@@ -11,7 +11,7 @@ from experiments.command_line import RecipeFile, RunsFolder, Seeds, run
 from stereoweave.cli.options import make_parent_folder, require_train_extra
 
 
-def ablations(
+def ablations(  # noqa: PLR0913 - each is an option of the command line
     recipe: RecipeFile,
     out: RunsFolder,
     report: Annotated[
@@ -25,6 +25,10 @@ def ablations(
         Path, typer.Option(metavar="FOLDER", help="Set of held-out pairs from stereoweave synth make.")
     ] = Path("runs/synth_val/rooms"),
     seeds: Seeds = 2,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(metavar="VARIATION", help="Train only the base and this variation; repeat for more."),
+    ] = None,
 ) -> None:
     """Train and score WeaveNet with one design choice changed at a time.
 
@@ -36,7 +40,7 @@ def ablations(
     with require_train_extra():
         from experiments.ablations.experiment import plan, run_ablations
         from stereoweave.learn.recipe import read_recipe
-    run_ablations(plan(read_recipe(recipe), seeds), out, rendered, report, Console())
+    run_ablations(plan(read_recipe(recipe), seeds, only or ()), out, rendered, report, Console())
     typer.echo(f"rows: {report}")
 
 

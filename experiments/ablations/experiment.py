@@ -18,6 +18,7 @@ from experiments.trial import Trial
 from stereoweave.bench.edge_metrics import edge_bad_percent, edge_epe_px, flying_percent
 from stereoweave.bench.projected_views import DisparityMethod
 from stereoweave.data.shards import Shards
+from stereoweave.errors import StereoweaveError
 from stereoweave.io.files import make_folder, replacing
 from stereoweave.learn import checkpoint
 from stereoweave.learn.checkpoint import Checkpoint
@@ -53,14 +54,27 @@ VARIATIONS: dict[str, dict[str, dict[str, Any]]] = {
     "comparison at 1/2": {"looked_up": {"model": "weave_small_looked_up"}},
     "exponent p on the normalised disparity": {"exponent_1.5": {"exponent": 1.5}},
     "projection loss": {"projection": {"alpha_p": 100.0}},
+    "both of the paper's": {"projection_exponent_1.5": {"alpha_p": 100.0, "exponent": 1.5}},
     "mix of data": {"mix": {"mix": MIX}},
 }
 
 _CPU = torch.device("cpu")
 
 
-def plan(base: Recipe, seeds: int) -> list[Trial]:
-    """Return trials of all variations with the first seed, then with each further seed."""
+def plan(base: Recipe, seeds: int, only: Sequence[str] = ()) -> list[Trial]:
+    """Return trials of all variations with the first seed, then with each further seed.
+
+    Args:
+        base: Recipe that every variation changes.
+        seeds: Number of seeds.
+        only: Names of the only variations to train beside the base; all if empty.
+
+    Raises:
+        StereoweaveError: If `only` has an unknown name.
+    """
+    names = [name for variations in VARIATIONS.values() for name in variations]
+    if unknown := [name for name in only if name not in names]:
+        raise StereoweaveError(f"only: expected some of {', '.join(names)}, found {unknown[0]!r}")
     return [
         Trial(
             claim=choice,
@@ -70,6 +84,7 @@ def plan(base: Recipe, seeds: int) -> list[Trial]:
         for seed in range(base.seed, base.seed + seeds)
         for choice, variations in VARIATIONS.items()
         for name, changes in variations.items()
+        if not only or name in (BASE, *only)
     ]
 
 

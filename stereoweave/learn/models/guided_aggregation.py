@@ -6,8 +6,6 @@ Matching, CVPR 2019, arXiv:1904.06587. Where the paper is silent, the layers do 
 neighbour's place. Written-out references of both layers are in tests/helpers/plain_guided_aggregation.py.
 """
 
-from functools import reduce
-
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
@@ -42,25 +40,27 @@ def aggregate_semi_globally(
     costs = costs.float()
     shared = weights.float().view(batch, DIRECTIONS, channels, SEMI_GLOBAL_WEIGHTS, height, width)
     shared = F.normalize(shared, p=1, dim=3)
-    rows, columns = costs.movedim(3, 0), costs.movedim(4, 0)
     down, up, right, left = shared.unbind(1)
-    return reduce(
-        torch.maximum,
-        [
-            _follow(rows, down.movedim(3, 0)).movedim(0, 3),
-            _follow(rows.flip(0), up.movedim(3, 0).flip(0)).flip(0).movedim(0, 3),
-            _follow(columns, right.movedim(4, 0)).movedim(0, 4),
-            _follow(columns.flip(0), left.movedim(4, 0).flip(0)).flip(0).movedim(0, 4),
-        ],
-    )
+    vertical = _follow_both_ways(costs.movedim(3, 0), down.movedim(3, 0), up.movedim(3, 0))
+    horizontal = _follow_both_ways(costs.movedim(4, 0), right.movedim(4, 0), left.movedim(4, 0))
+    return torch.maximum(vertical.movedim(0, 3), horizontal.movedim(0, 4))
+
+
+def _follow_both_ways(costs: Tensor, there: Tensor, back: Tensor) -> Tensor:
+    """Return the larger of the costs aggregated along the first axis and against it.
+
+    Both ways are followed in one batch, which halves the number of small operations.
+    """
+    costs = torch.cat([costs, costs.flip(0)], 1)
+    forwards, backwards = _follow(costs, torch.cat([there, back.flip(0)], 1)).chunk(2, 1)
+    return torch.maximum(forwards, backwards.flip(0))
 
 
 def _follow(
     costs: Float[Tensor, "n b c d m"], weights: Float[Tensor, "n b c 5 m"]
 ) -> Float[Tensor, "n b c d m"]:
     """Aggregate the costs along the first axis, from its start to its end."""
-    paths = costs.contiguous().unbind(0)
-    shares = weights.unsqueeze(4).contiguous().unbind(0)
+    paths, shares = costs.unbind(0), weights.unsqueeze(4).unbind(0)
     aggregated = [paths[0] * shares[0].sum(2)]
     for cost, share in zip(paths[1:], shares[1:], strict=True):
         before = aggregated[-1]

@@ -141,12 +141,12 @@ def cost_volume(
 ) -> Float[Tensor, "b c2 d h w"]:
     """Concatenate the features of column x of `left` and column x - stride * d of `right`, d < levels.
 
-    Right features are 0 if their column is outside the map. A window as wide as the map slides over the right
-    features, which are zero-padded on the left; in the window's last position, d is 0. The plain reference is
-    `cost_volume_plain` in tests/learn/models/test_psmnet.py.
+    Right features are 0 if their column is outside the map. The plain reference is `cost_volume_plain` in
+    tests/learn/models/test_psmnet.py.
     """
-    windows = F.pad(right, (stride * (levels - 1), 0)).unfold(3, right.shape[3], stride)
-    shifted = windows.flip(3).transpose(2, 3)
+    farthest, width = stride * (levels - 1), right.shape[3]
+    padded = F.pad(right, (farthest, 0))
+    shifted = torch.stack([padded[..., x : x + width] for x in range(farthest, -1, -stride)], 2)
     return torch.cat([left.unsqueeze(2).expand_as(shifted), shifted], 1)
 
 

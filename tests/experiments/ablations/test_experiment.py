@@ -32,6 +32,7 @@ CHOICES = [
     "upsampling",
     "exponent p on the normalised disparity",
     "projection loss",
+    "both of the paper's",
     "mix of data",
 ]
 SCORES = [
@@ -111,6 +112,27 @@ def test_every_variation_is_planned_with_the_first_seed_before_any_with_the_next
     ]
     assert len({trial.recipe.name for trial in planned}) == len(planned) == 2 * len(set(names))
     assert len({fingerprint(trial.recipe) for trial in planned}) == len(planned)
+
+
+def test_only_some_variations_are_planned_beside_the_base():
+    planned = plan(RECIPE, 2, ["projection", "exponent_1.5"])
+    assert [(trial.recipe.seed, trial.setting) for trial in planned] == [
+        (seed, name) for seed in (0, 1) for name in (BASE, "exponent_1.5", "projection")
+    ]
+    assert complaint(plan, RECIPE, 2, ["projection", "magic"]).endswith(", mix, found 'magic'")
+
+
+def test_the_papers_two_ideas_are_trained_alone_and_together():
+    found = {trial.setting: trial.recipe for trial in plan(RECIPE, 1)}
+    assert {
+        name: (found[name].alpha_p, found[name].exponent)
+        for name in (BASE, "projection", "exponent_1.5", "projection_exponent_1.5")
+    } == {
+        BASE: (0, 1),
+        "projection": (100, 1),
+        "exponent_1.5": (0, 1.5),
+        "projection_exponent_1.5": (100, 1.5),
+    }
 
 
 def test_every_variation_has_a_network_and_a_loss():

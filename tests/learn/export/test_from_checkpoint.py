@@ -154,6 +154,19 @@ def test_a_matcher_returns_the_pixels_that_its_network_predicts():
     assert (matcher.multiple_of, matcher.max_disparity_px) == (16, 48)
 
 
+@pytest.mark.parametrize(
+    ("model", "parts"),
+    [("psmnet", "pooling windows"), ("ganet_11", "recursions over rows and columns")],
+)
+def test_a_network_whose_graph_is_for_one_size_cannot_be_exported(tmp_path, model, parts):
+    checkpoint.save(checkpoint_of(untrained(model), recipe_of(model)), tmp_path / "last.pt")
+    assert complaint(export.export_matcher, tmp_path, tmp_path / "out" / "a.onnx") == (
+        f"tiny: expected a network for pairs of any size, found {model}, whose {parts} depend on the size; "
+        "score it with `stereoweave bench networks`"
+    )
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_network_that_estimates_depth_cannot_be_exported(tmp_path):
     recipe = recipe_of("fast_depth", target="depth")
     checkpoint.save(checkpoint_of(untrained("fast_depth"), recipe), tmp_path / "last.pt")
