@@ -23,6 +23,7 @@ import jaxtyping
 import numpy as np
 import pytest
 from other_processes import UNMEASURED, find_free_ports, list_processes
+from tracing import without_tracer
 from xdist.workermanage import WorkerController
 
 TESTDATA = Path(
@@ -119,10 +120,8 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: p
 @pytest.fixture
 def untraced() -> Iterator[None]:
     """Run a test of processor time without the tracer of coverage, which takes two thirds of it."""
-    tracer = sys.gettrace()
-    sys.settrace(None)
-    yield
-    sys.settrace(tracer)
+    with without_tracer():
+        yield
 
 
 @pytest.fixture

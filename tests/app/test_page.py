@@ -74,6 +74,7 @@ def answered(browser, address) -> Iterator[Visit]:
         visit.give(left=TEXTURED / "left.png", right=TEXTURED / "right.png")
         visit.page.get_by_text("Layout and calibration").click()
         visit.give(calibration=TEXTURED / "calib.txt")
+        visit.page.get_by_label("fast").check()
         assert "640×480 px" in visit.find()
         yield visit
 
@@ -155,6 +156,7 @@ def test_visitors_do_not_see_each_others_results(answered, visit, tmp_path):
     left, right = (read_image(TEXTURED / f"{side}.png")[::-1] for side in ("left", "right"))
     Image.fromarray(np.hstack([left, right])).save(tmp_path / "upside_down.png")
     visit.give(left=tmp_path / "upside_down.png")
+    visit.page.get_by_label("fast").check()
     visit.find()
     assert difference(visit.move("0"), left) < 4
     assert difference(answered.move("0"), left[::-1]) < 4

@@ -129,6 +129,7 @@ def test_two_visitors_work_at_once_and_cancelling_ends_one_job(server, browser, 
         patient.page.click("#find")
         patient.page.locator("#status").get_by_text("matching 2560×1920 px").wait_for()
         quick.give(**pair)
+        quick.page.get_by_label("fast").check()
         assert f"{WIDTH}×{HEIGHT} px, matched in" in quick.find()
         assert patient.page.locator("#status .notice").count() == 0  # still at work
         before = workers_of(pid)
@@ -145,6 +146,7 @@ def test_two_visitors_work_at_once_and_cancelling_ends_one_job(server, browser, 
 
 def test_after_cancelling_the_result_before_stays(visit, pair, large_pair):
     visit.give(**pair)
+    visit.page.get_by_label("fast").check()
     visit.find()
     visit.take_back()
     visit.give(**large_pair)
@@ -280,6 +282,7 @@ def answered(browser, server, pair) -> Iterator[Visit]:
     """Yield a visitor who has the small pair's result and looks at its 3-D pictures."""
     with visiting(browser, server[1]) as visit:
         visit.give(**pair)
+        visit.page.get_by_label("fast").check()
         visit.find()
         visit.open("3-D picture")
         visit.page.locator("#picture").get_by_text("left_anaglyph_dubois").wait_for()

@@ -23,7 +23,7 @@ LAYOUTS = (
 
 def write_error_examples(folder: Path) -> None:
     """Write a pair, the same pair with the right picture 2 px lower, converging cameras or a zoomed
-    right picture, plain pictures, and two calibrations.
+    right picture, plain pictures, an upright one, and two calibrations.
     """
     for name, content in _make_error_examples().items():
         (folder / name).write_bytes(content)
@@ -51,6 +51,7 @@ def _write_new_examples(folder: Path) -> None:
     write_image(folder / "inwards_right.png", inwards.pair.right)
     write_image(folder / "zoomed.png", zoomed.pair.right)
     write_image(folder / "both.png", np.hstack([left, right]))
+    write_image(folder / "turned.png", np.ascontiguousarray(np.rot90(right)))
     write_image(folder / "plain.png", np.full((480, 640, 3), 90, np.uint8))
     write_rig(folder / "turned.yml", rig_of(pinhole))
     shutil.copy(Path(__file__).parents[2] / "examples" / "calib.txt", folder / "rectified.txt")

@@ -1,0 +1,16 @@
+"""The tracer of coverage, which takes a third to two thirds of a test's time."""
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+
+@contextmanager
+def without_tracer() -> Iterator[None]:
+    """Run the block without a tracer in this thread; what it calls is not measured."""
+    tracer = sys.gettrace()
+    sys.settrace(None)
+    try:
+        yield
+    finally:
+        sys.settrace(tracer)
