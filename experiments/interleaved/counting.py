@@ -72,5 +72,4 @@ def make_pictures(left: _Image, right: _Image) -> Iterator[tuple[str, _Image]]:
 def _store_jpeg(image: _Image) -> _Image:
     quality = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
     coded = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), quality)[1]
-    decoded: _Image = cv2.imdecode(coded, cv2.IMREAD_COLOR_RGB)
-    return decoded
+    return cv2.imdecode(coded, cv2.IMREAD_COLOR_RGB)  # type: ignore[return-value]  # None only for bad data

@@ -164,7 +164,8 @@ def read_hdr(path: Path, picture: Any) -> UInt8[np.ndarray, "h w 3"]:
 
     deep = open_heif(path, convert_hdr_to_8bit=False)[picture.tell()]
     stored = np.asarray(deep)
-    colours, bits = deep.info["nclx_profile"], deep.info["bit_depth"]
+    info: dict[str, Any] = deep.info
+    colours, bits = info["nclx_profile"], int(info["bit_depth"])
     # pillow-heif shifts the bits of deep pictures up to the 16th.
     white = 255 if stored.dtype == np.uint8 else ((1 << bits) - 1) << 16 - bits
     channels = stored[..., :3] if stored.ndim == 3 else np.broadcast_to(stored[..., None], (*stored.shape, 3))
