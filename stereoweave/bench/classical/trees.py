@@ -55,8 +55,8 @@ def _list_edges(
     numbers = np.arange(image.shape[0] * image.shape[1], dtype=np.int32).reshape(image.shape[:2])
     across, down = (np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])
     ends = [np.stack([numbers[one].ravel(), numbers[other].ravel()], 1) for one, other in (across, down)]
-    weights = [
-        cv2.absdiff(image[one], image[other]).max(-1, initial=0).ravel() for one, other in (across, down)
-    ]
-    order = np.argsort(np.concatenate(weights), kind="stable")
-    return np.concatenate(ends)[order], np.concatenate(weights)[order]
+    levels = image.astype(np.int16)
+    steps = [abs(levels[one] - levels[other]).max(-1).ravel() for one, other in (across, down)]
+    weights = np.concatenate(steps).astype(np.uint8)
+    order = np.argsort(weights, kind="stable")
+    return np.concatenate(ends)[order], weights[order]

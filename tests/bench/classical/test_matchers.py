@@ -27,6 +27,15 @@ def test_each_finds_the_disparity_of_random_dots(dots, name):
     np.testing.assert_allclose(disparity_px[4:-4, 14:-4], 7, atol=0.25)
 
 
+@pytest.mark.parametrize("name", CLASSICAL_MATCHERS)
+@pytest.mark.parametrize("size", [(1, 9), (9, 1), (1, 1)])
+def test_each_matches_a_pair_of_one_row_or_column(name, size):
+    image = np.full((*size, 3), 90, np.uint8)
+    disparity_px = make_classical_matcher(name)(StereoPair(left=image, right=image))
+    assert disparity_px.shape == size
+    assert np.isfinite(disparity_px).all()
+
+
 def test_an_unknown_matcher_is_named_with_those_that_are_known():
     with pytest.raises(StereoweaveError, match="adaptive_window, dynamic_programming, 3dmst, found 'words'"):
         make_classical_matcher("words")
