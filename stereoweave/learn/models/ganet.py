@@ -7,9 +7,9 @@ aggregation refines it at full resolution. A guidance network predicts the weigh
 
 The paper describes GA-Net-15 and names smaller ones by their number of 3-D convolutions. The authors' code
 (github.com/feihuzhang/GANet, MIT licence) has GA-Net-11 and GA-Net-deep, and these are built here, layer by
-layer. As published, GA-Net-deep has 6,580,112 parameters (6.58 M in comparisons by others), 6,560 of them in
-a layer that it never uses (`deconv0b`), which is left out here. The paper's own counts, such as 2.3 M for
-GA-Net-15, are of the cost aggregation alone.
+layer. GA-Net-deep's code has 6,580,112 parameters, 6,560 of them in a layer that it never uses (`deconv0b`),
+which is left out here. The paper's own counts, such as 2.3 M for GA-Net-15, are of the cost aggregation alone
+(the authors' issue 66), so they cannot be compared.
 
 Deviations, and choices where the paper is silent:
 

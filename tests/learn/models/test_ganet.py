@@ -23,7 +23,7 @@ def convolutions_of(size, kinds):
         return sum(isinstance(layer, kinds) for layer in GANet(size).modules())
 
 
-def test_the_networks_have_the_3d_convolutions_after_which_they_are_named():
+def test_the_networks_have_as_many_3d_convolutions_as_their_authors_count():
     kinds = torch.nn.Conv3d, torch.nn.ConvTranspose3d
     # Without those that reduce the costs to one channel for an output, which the authors do not count.
     assert convolutions_of(GANET_11, kinds) - len(GANET_11.output_weights) == 11

@@ -25,7 +25,7 @@ PARAMETERS = {
     "mc_cnn": 148_352,
     "scvnet": 2_315_654,
     "ganet_11": 4_483_728,
-    # As published, less 6,560 of a layer without use: 8 * 8 * 3 * 4 * 4 + 16 * 8 * 27 and two batch norms.
+    # As the published code, less a layer without use: 8 * 8 * 48 + 16 * 8 * 27 and two batch norms of 8.
     "ganet_deep": 6_580_112 - 6_560,
 }
 CODE_NETWORKS = [name for name in MODELS if not name.startswith(("weave", "mc_cnn"))]
