@@ -72,14 +72,17 @@ LOOPBACK_ALONE = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
 # The garbage collector would traverse all imported modules repeatedly, for a quarter of the tests' time.
 gc.disable()
 
+# Files that take minutes, besides those directly in tests/.
+LONG = ("test_deployment.py", "test_ray_engine.py")
+
 MISSING = [name for name, capability in CAPABILITIES.items() if not capability.present]
 LEFT_OUT = pytest.StashKey[dict[str, int]]()
 
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    # The tests directly in tests/ first: they take longest, and one process would end late because of them.
-    items.sort(key=lambda item: item.path.parent != Path(__file__).parent)
+    # The longest first: one process would end late because of them.
+    items.sort(key=lambda item: item.path.parent != Path(__file__).parent and item.path.name not in LONG)
     if os.environ.get("STEREOWEAVE_REQUIRE_ALL") == "1":
         return
     left_out = [item for item in items if any(map(item.get_closest_marker, MISSING))]

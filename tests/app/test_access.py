@@ -11,6 +11,7 @@ from typing import Any
 from urllib.parse import quote
 
 import pytest
+from other_processes import UNMEASURED
 from page_examples import Visitor, file_data, start, stop
 from starlette.applications import Starlette
 from starlette.requests import Request
@@ -199,7 +200,7 @@ def test_an_invalid_request_body_is_refused(visitor, content):
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_uploads_are_removed_when_a_signal_ends_the_page(tmp_path, small_pair, number):
-    server, address = start(tmp_path)
+    server, address = start(tmp_path, **UNMEASURED)
     with Visitor(address) as visitor:
         [path] = visitor.upload(small_pair[0])
     assert Path(path).is_relative_to(tmp_path)

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import closing
 
 import pytest
+from other_processes import UNMEASURED
 from page_examples import start, stop
 
 from stereoweave.cli.root import main
@@ -16,7 +17,7 @@ pytestmark = pytest.mark.system
 
 @pytest.fixture(scope="module")
 def address(tmp_path_factory) -> Iterator[str]:
-    server, address = start(tmp_path_factory.mktemp("page"))
+    server, address = start(tmp_path_factory.mktemp("page"), **UNMEASURED)
     yield address
     assert stop(server) == ""
 

@@ -20,8 +20,11 @@ SERVER = [
 ]
 
 
-def start(folder: Path, *words: str) -> tuple[subprocess.Popen[str], str]:
-    """Start a separate server with its temporary files in `folder`; return it and its address."""
+def start(folder: Path, *words: str, **variables: str) -> tuple[subprocess.Popen[str], str]:
+    """Start a separate server with its temporary files in `folder`; return it and its address.
+
+    `variables` are of its environment.
+    """
     # A shell or nohup that runs the tests in the background ignores both signals, and processes inherit that.
     before = {number: signal.signal(number, signal.SIG_DFL) for number in (signal.SIGINT, signal.SIGHUP)}
     server = subprocess.Popen(
@@ -29,7 +32,7 @@ def start(folder: Path, *words: str) -> tuple[subprocess.Popen[str], str]:
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env={**os.environ, "TMPDIR": str(folder), "PYTHONUNBUFFERED": "1"},
+        env={**os.environ, "TMPDIR": str(folder), "PYTHONUNBUFFERED": "1", **variables},
     )
     for number, handler in before.items():
         signal.signal(number, handler)

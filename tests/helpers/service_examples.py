@@ -1,5 +1,6 @@
 """Requests that are each malformed in a different way."""
 
+import functools
 import io
 import socket
 import struct
@@ -20,6 +21,7 @@ BOTH = {"left": LEFT, "right": RIGHT}
 Sender = Callable[[httpx.Client], tuple[int, str]]
 
 
+@functools.cache
 def make_malformed_requests(most_megabytes: float) -> dict[str, Sender]:
     """Return requests, keyed by what is wrong with each."""
     files = {**_cut_pictures_off(), **_make_other_files(), **_make_wrong_sizes()}

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from other_processes import UNMEASURED
 from plain_rendering import plain_rendering, plain_splat
 
 import stereoweave
@@ -265,7 +266,7 @@ def test_the_fast_renderer_equals_the_plain_one(rng, position, lowest_px, conver
 
 def in_new_process(code, home, **variables):
     environment = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_")}
-    environment |= {"HOME": str(home), "XDG_CACHE_HOME": str(home / "cache"), **variables}
+    environment |= {"HOME": str(home), "XDG_CACHE_HOME": str(home / "cache"), **UNMEASURED, **variables}
     return subprocess.run(
         [sys.executable, "-B", "-c", code],
         env=environment,

@@ -22,7 +22,7 @@ import pytest
 import watching
 from hostile_calibrations import HOSTILE
 from hostile_requests import make_hostile_requests
-from other_processes import MEASURED_ALONE
+from other_processes import MEASURED_ALONE, UNMEASURED
 from prometheus_client import Metric
 from prometheus_client.parser import text_string_to_metric_families
 from ray.exceptions import RayActorError
@@ -194,7 +194,13 @@ def test_hostile_requests_and_calibrations_neither_delay_health_checks_nor_fill_
     assert len(requests) >= 260
     watcher = [sys.executable, watching.__file__, str(running.client.base_url), str(running.pid)]
     with (
-        subprocess.Popen(watcher, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as watch,
+        subprocess.Popen(
+            watcher,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env=os.environ | UNMEASURED,
+        ) as watch,
         ThreadPoolExecutor(12) as pool,
     ):
         sent = {
