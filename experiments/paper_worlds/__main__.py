@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from experiments.command_line import run
+from experiments.command_line import RecipeFile, run
 from stereoweave.cli.options import make_parent_folder, require_train_extra
 from stereoweave.cli.tables import print_means
 
@@ -15,9 +15,11 @@ _COLUMNS = {"EPE cm": "epe_cm", "deviation": "epe_cm_sd", "EPE px": "epe_px", "M
 
 
 def paper_worlds(
+    recipe: RecipeFile,
     runs: Annotated[
-        list[Path], typer.Argument(metavar="RUN...", help="Run folders of stereoweave train, or checkpoints.")
-    ],
+        list[Path] | None,
+        typer.Argument(metavar="[RUN]...", help="Run folders of stereoweave train, or checkpoints."),
+    ] = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="CSV file to write.")] = Path("worlds.csv"),
     most: Annotated[
         int | None, typer.Option(min=1, help="Greatest number of frames to score per split (default: all).")
@@ -25,11 +27,13 @@ def paper_worlds(
 ) -> None:
     """Score networks in the worlds that they trained on and in others, beside the nearest training frame."""
     from stereoweave.bench.tables import write_csv
+    from stereoweave.learn.recipe import read_recipe
 
     make_parent_folder(out)
+    read = read_recipe(recipe)
     with require_train_extra():
         from experiments.paper_worlds.scoring import score_worlds
-    rows = list(score_worlds(runs, most))
+    rows = list(score_worlds(read, runs or [], most))
     write_csv(out, rows)
     for split in dict.fromkeys(row.split for row in rows):
         chosen = [row for row in rows if row.split == split]

@@ -54,22 +54,24 @@ class WorldsRow:
     ssim: float
 
 
-def score_worlds(runs: Sequence[Path], most: int | None = None) -> Iterator[WorldsRow]:
+def score_worlds(recipe: Recipe, runs: Sequence[Path], most: int | None = None) -> Iterator[WorldsRow]:
     """Score runs, and methods without training, on the held-out frames and on those of left-out worlds.
 
     Args:
-        runs: Run folders of `stereoweave train`, or checkpoints, all with the same held-out pairs of a set by
-            world, and a split that they leave out.
+        recipe: Recipe of a set by world, with a split that it leaves out.
+        runs: Run folders of `stereoweave train`, or checkpoints, all with the recipe's held-out pairs.
         most: Greatest number of frames to score per split, evenly spread; None for all.
 
     Raises:
-        StereoweaveError: The runs have different pairs, do not leave out a split, or share a name; or the set
-            is incomplete.
+        StereoweaveError: The recipe leaves out no split of a set by world; a run has other pairs; two runs
+            share a name; or the set is incomplete.
     """
+    _check_recipe(recipe)
     kept = {(run if run.is_dir() else run.with_suffix("")).name: _load(run) for run in runs}
     if len(kept) < len(runs):
         raise StereoweaveError("runs: expected different names, found a duplicate; rename a run")
-    recipe = _find_common_recipe({name: one.recipe for name, one in kept.items()})
+    for name, one in kept.items():
+        _check_pairs(name, one.recipe, recipe)
     training, *parts = divide_frames(recipe)
     methods = {MEDIAN: make_median_method(DatasetFrames(training))}
     methods |= {name: make_method(one) for name, one in kept.items()}
@@ -131,23 +133,21 @@ def _load(run: Path) -> Checkpoint:
     return checkpoint.load(run / "last.pt" if run.is_dir() else run)
 
 
-def _find_common_recipe(recipes: Mapping[str, Recipe]) -> Recipe:
-    """Return the first recipe. Raises StereoweaveError if another one has different pairs, or no worlds."""
-    first, *others = recipes
-    recipe = recipes[first]
+def _check_recipe(recipe: Recipe) -> None:
     if recipe.dataset != WORLDS or not recipe.leave_out:
         raise StereoweaveError(
-            f"{first}: expected a run with dataset = {WORLDS!r} and a split in leave_out, found dataset = "
+            f"{recipe.name}: expected dataset = {WORLDS!r} and a split in leave_out, found dataset = "
             f"{recipe.dataset!r} and leave_out = {recipe.leave_out!r}; "
-            "train recipes/paper/propeller_worlds.toml"
+            "see recipes/paper/propeller_worlds.toml"
         )
-    for name in others:
-        if identify_held_out(recipes[name]) != identify_held_out(recipe):
-            raise StereoweaveError(
-                f"{name}: expected the held-out pairs of {first}, {identify_held_out(recipe)}, found "
-                f"{identify_held_out(recipes[name])}; score this run separately"
-            )
-    return recipe
+
+
+def _check_pairs(name: str, trained: Recipe, recipe: Recipe) -> None:
+    if identify_held_out(trained) != identify_held_out(recipe):
+        raise StereoweaveError(
+            f"{name}: expected a run with the held-out pairs of {recipe.name}, {identify_held_out(recipe)}, "
+            f"found {identify_held_out(trained)}; score it with its own recipe"
+        )
 
 
 def _spread(frames: Sequence[Frame], most: int | None) -> list[Frame]:

@@ -65,8 +65,8 @@ def folder(tmp_path, monkeypatch):
         (f"paper {RECIPE} -o runs --report report --exponent-only --jobs 0", ["--jobs"]),
         ("ablations none.toml -o runs --report rows.csv", ["none.toml", "expected a recipe"]),
         ("stage_costs none.pt -o rows.csv", ["none.pt", "no such checkpoint"]),
-        ("paper_worlds none.pt -o rows.csv", ["none.pt", "no such checkpoint"]),
-        ("paper_worlds -o rows.csv", ["RUN...", "--help"]),
+        ("paper_worlds none.toml -o rows.csv", ["none.toml", "expected a recipe"]),
+        (f"paper_worlds {PAPER_RECIPE} -o rows.csv", ["experiment", "dataset = 'paper_worlds'"]),
         ("paper_sets", ["--report", "--help"]),
         ("paper_sets --report rows --size big", ["--size: expected width x height"]),
         ("whole_films none.mp4 -o rows.csv", ["none.mp4", "no such"]),
@@ -141,13 +141,17 @@ def test_run_times_are_written_one_row_per_network(folder, monkeypatch, capfd):
 def test_scores_by_world_are_written_and_printed_by_split(folder, monkeypatch, capfd):
     from experiments.paper_worlds import scoring
 
+    given = []
     numbers = dict.fromkeys(scoring.WorldsRow.__annotations__, 2.5) | {"method": "tiny", "steps": 7}
     rows = [
         scoring.WorldsRow(**numbers | {"split": split, "pairs": pairs})
         for split, pairs in (("random", 3), ("disjoint", 5))
     ]
-    monkeypatch.setattr(scoring, "score_worlds", lambda runs, most: iter(rows))
-    assert run("paper_worlds tiny.pt") == 0
+    monkeypatch.setattr(
+        scoring, "score_worlds", lambda recipe, runs, most: given.append((recipe.name, runs)) or rows
+    )
+    assert run(f"paper_worlds {PAPER_RECIPE} tiny.pt") == 0
+    assert given == [("experiment", [Path("tiny.pt")])]
     assert [(row["split"], row["epe_cm"]) for row in read_rows("worlds.csv")] == [
         ("random", "2.5"),
         ("disjoint", "2.5"),

@@ -60,8 +60,8 @@ def run(recipe, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def rows(run):
-    return {(row.split, row.method): row for row in score_worlds([run])}
+def rows(recipe, run):
+    return {(row.split, row.method): row for row in score_worlds(recipe, [run])}
 
 
 def test_every_method_is_scored_on_both_splits(rows):
@@ -93,27 +93,24 @@ def test_the_truth_has_no_error_and_no_warping_is_at_15_m(rows):
     assert rows["disjoint", "no warping"].epe_cm == pytest.approx(1000, abs=0.1)
 
 
-def test_fewer_frames_are_scored_on_request(run):
-    assert [row.pairs for row in score_worlds([run], 3)] == 6 * [1] + 6 * [3]
+def test_fewer_frames_are_scored_on_request_and_runs_are_optional(recipe):
+    assert [row.pairs for row in score_worlds(recipe, [], 3)] == 5 * [1] + 5 * [3]
 
 
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
         ({"leave_out": ""}, "a split in leave_out, found dataset = 'paper_worlds' and leave_out = ''"),
-        ({"dataset": "paper"}, "expected a run with dataset = 'paper_worlds'"),
+        ({"dataset": "paper"}, "expected dataset = 'paper_worlds'"),
     ],
 )
-def test_a_run_without_worlds_is_a_one_line_error(recipe, tmp_path, changes, told):
-    other = replace(recipe, **changes)
-    checkpoint.save(checkpoint_of(build_network(other).eval(), other), tmp_path / "other.pt")
-    assert told in complaint(lambda: list(score_worlds([tmp_path / "other.pt"])))
+def test_a_recipe_without_worlds_is_a_one_line_error(recipe, changes, told):
+    assert told in complaint(lambda: list(score_worlds(replace(recipe, **changes), [])))
 
 
-def test_runs_of_different_pairs_or_equal_names_are_one_line_errors(recipe, run, tmp_path):
+def test_a_run_of_other_pairs_and_equal_names_are_one_line_errors(recipe, run):
     other = replace(recipe, validation_pairs=recipe.validation_pairs + 1)
-    checkpoint.save(checkpoint_of(build_network(other).eval(), other), tmp_path / "other.pt")
-    assert "other: expected the held-out pairs of tiny" in complaint(
-        lambda: list(score_worlds([run, tmp_path / "other.pt"]))
+    assert "tiny: expected a run with the held-out pairs of tiny" in complaint(
+        lambda: list(score_worlds(other, [run]))
     )
-    assert "runs: expected different names" in complaint(lambda: list(score_worlds([run, run])))
+    assert "runs: expected different names" in complaint(lambda: list(score_worlds(recipe, [run, run])))

@@ -368,7 +368,7 @@ def test_a_folder_without_a_description_is_not_a_set(tmp_path):
 
 def test_the_version_depends_on_the_sources_that_make_pairs_and_on_no_others(tmp_path, monkeypatch):
     monkeypatch.undo()
-    drawn = ("synth/scenes/ship.py", "synth/rendering/shaders/shade.frag")
+    drawn = ("synth/scenes/ship.py", "synth/rendering/shaders/shade.frag", "data/poses.py")
     changed = (*drawn, "data/packing.py", "data/samples.py", "stereo.py")
     files = [tmp_path / name for name in ("synth/sets/make.py", "data/paper_layout.py", *changed)]
     for file in files:
