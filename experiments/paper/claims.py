@@ -273,8 +273,8 @@ def run_time_table(rows: Iterable[Mapping[str, str]]) -> str:
     lines = [f"| {' | '.join(columns)} |", "|---" * len(columns) + "|"]
     for row in rows:
         paper = RUN_TIMES.get(row["network"])
-        onnx_ms, onnx_relative = (
-            float(row[name]) if row[name] else None for name in ("onnx_ms", "onnx_relative")
+        onnx_relative, onnx_ms = (
+            float(row[name]) if row[name] else None for name in ("onnx_relative", "onnx_ms")
         )
         lines.append(
             f"| {NAMES.get(row['network'], row['network'])} | {row['parameters']} "
