@@ -1,11 +1,13 @@
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
+import torch
 from learn_examples import RECIPE
 
 from stereoweave.errors import FormatError
+from stereoweave.learn.models import build_network
 from stereoweave.learn.recipe import Recipe, parse_recipe, read_recipe
 
 RECIPES = sorted((Path(__file__).parents[2] / "recipes").rglob("*.toml"))
@@ -81,6 +83,22 @@ def test_table_1_has_a_recipe_for_each_of_its_cells():
         # Only the paper's own network uses its two contributions and the transfer.
         own = (1.5, 1.0, "checkpoints/fast_depth.pt") if recipe.model == "fast_depth" else (1.0, 0.0, "")
         assert (recipe.exponent, recipe.alpha_p, recipe.start_from) == own
+
+
+@pytest.mark.parametrize("file", RECIPES, ids=lambda file: file.stem)
+def test_the_crops_of_a_shipped_recipe_fit_its_network(file):
+    recipe = read_recipe(file)
+    with torch.device("meta"):
+        multiple = build_network(recipe).multiple_of
+    assert [side % multiple for side in recipe.crop_size] == [0, 0]
+
+
+def test_every_rival_can_be_trained_on_the_crops_of_the_experiment_on_propellers():
+    (base,) = (read_recipe(file) for file in RECIPES if file.stem == "propeller")
+    for model in ("dispnet", "densemapnet", "psmnet", "scvnet", "ganet_11", "fast_depth"):
+        with torch.device("meta"):
+            multiple = build_network(replace(base, model=model)).multiple_of
+        assert [side % multiple for side in base.crop_size] == [0, 0]
 
 
 def test_the_learning_rate_rises_stays_and_falls():

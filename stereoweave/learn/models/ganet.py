@@ -44,6 +44,8 @@ from stereoweave.learn.models.layers import ConvBlock, cost_volume, pad_to_multi
 
 # Factor by which the cost volume is smaller than the image, also in disparity.
 _STEP = 3
+# Images are padded to multiples of this, 16 times the step, inside the network.
+_PADDED = 48
 # Channels of the features from 1/3 to 1/48, and of the costs from 1/3 to 1/12.
 _FEATURES = (32, 48, 64, 96, 128)
 _COSTS = (32, 48, 64)
@@ -250,7 +252,8 @@ class GANet(nn.Module):
         max_disparity_px: Largest candidate, rounded up to a multiple of 12.
     """
 
-    multiple_of = 48
+    # Of crops and pairs in recipes, which need not be multiples of 48.
+    multiple_of = 16
     predicts: ClassVar[Literal["code", "disparity_px"]] = "disparity_px"
 
     def __init__(self, size: GANetSize, max_disparity_px: int = 192) -> None:
@@ -290,7 +293,7 @@ class GANet(nn.Module):
 
     def _volumes(self, left: Tensor, right: Tensor) -> tuple[list[Tensor], list[Tensor]]:
         """Return the costs at 1/3 before, between and after the hourglasses, and the local weights."""
-        views = pad_to_multiple(torch.cat([left, right]), self.multiple_of)
+        views = pad_to_multiple(torch.cat([left, right]), _PADDED)
         batch = left.shape[0]
         features = self.features(views)
         thirds, sixths, local = self.guidance(views[:batch], features[:batch])
