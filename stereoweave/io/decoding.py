@@ -122,8 +122,10 @@ def decode(path: str | Path, picture: Image.Image) -> DecodedPicture:
 def _decode_hdr(path: Path, picture: Image.Image, name: str) -> DecodedPicture:
     """Decode the current picture of an open HEIC file of high dynamic range."""
     with _decoding(path):
-        image = Image.fromarray(heif.read_hdr(path, picture))
-    _check_decoded(path, picture.size, image.size)
+        deep = heif.decode_deep(path, picture)
+    height_px, width_px = deep.stored.shape[:2]
+    _check_decoded(path, picture.size, (width_px, height_px))
+    image = Image.fromarray(heif.map_deep(deep))
     return DecodedPicture(image, exif.read_tags(picture), f"HDR ({name}), tone-mapped to SDR (BT.709)")
 
 

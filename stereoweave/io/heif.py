@@ -45,6 +45,14 @@ _DISPARITY_ADJUSTMENT = bytes.fromhex("de22508536cb436587432f8705e7c78a")
 _HAS_DIRECTION = 8
 
 
+class DeepPicture(NamedTuple):
+    """A picture with all its bits as pillow-heif stores them, how many these are, and its `nclx_profile`."""
+
+    stored: np.ndarray[Any, Any]
+    bits: int
+    colours: dict[str, Any]
+
+
 class _Pose(NamedTuple):
     """A camera's place in metres, x, y and z, and its direction, as stored."""
 
@@ -152,8 +160,8 @@ def name_hdr(picture: Any) -> str | None:
     return HDR.get((picture.info.get("nclx_profile") or {}).get("transfer_characteristics", 0))
 
 
-def read_hdr(path: Path, picture: Any) -> UInt8[np.ndarray, "h w 3"]:
-    """Decode the current picture of an open HDR file with all its bits, and map its tones to sRGB.
+def decode_deep(path: Path, picture: Any) -> DeepPicture:
+    """Decode the current picture of an open HDR file with all its bits.
 
     Pillow's pictures have 8 bits, in which the steps of HDR are visible.
 
@@ -163,9 +171,13 @@ def read_hdr(path: Path, picture: Any) -> UInt8[np.ndarray, "h w 3"]:
     from pillow_heif import open_heif
 
     deep = open_heif(path, convert_hdr_to_8bit=False)[picture.tell()]
-    stored = np.asarray(deep)
     info: dict[str, Any] = deep.info
-    colours, bits = info["nclx_profile"], int(info["bit_depth"])
+    return DeepPicture(np.asarray(deep), int(info["bit_depth"]), info["nclx_profile"])
+
+
+def map_deep(picture: DeepPicture) -> UInt8[np.ndarray, "h w 3"]:
+    """Map the tones of an HDR picture to sRGB."""
+    stored, bits, colours = picture
     # pillow-heif shifts the bits of deep pictures up to the 16th.
     white = 255 if stored.dtype == np.uint8 else ((1 << bits) - 1) << 16 - bits
     channels = stored[..., :3] if stored.ndim == 3 else np.broadcast_to(stored[..., None], (*stored.shape, 3))
