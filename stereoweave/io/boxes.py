@@ -3,6 +3,7 @@
 import os
 import struct
 from collections.abc import Callable, Iterator, Sequence
+from itertools import count
 from typing import BinaryIO, NamedTuple
 
 from stereoweave.errors import FormatError
@@ -47,9 +48,11 @@ def find_boxes(file: BinaryIO, most: int) -> Iterator[Place]:
         FormatError: One of them is damaged or cut off, or there are more than `most`.
     """
     total, start = os.fstat(file.fileno()).st_size, 0
-    for _ in range(most):
+    for number in count():
         if start == total:
             return
+        if number == most:
+            raise FormatError(f"expected at most {most} boxes, found more; write the file again")
         file.seek(start)
         place = _read_place(file.read(_LONGEST_HEAD), start, total - start)
         if not place.begin <= place.end <= total:
@@ -59,7 +62,6 @@ def find_boxes(file: BinaryIO, most: int) -> Iterator[Place]:
             )
         yield place
         start = place.end
-    raise FormatError(f"expected at most {most} boxes, found more; write the file again")
 
 
 def split_boxes(content: bytes) -> list[Box]:
