@@ -175,29 +175,28 @@ def video(  # noqa: PLR0913 - each is an option of the command line
         from stereoweave.video.job import VideoJob
 
     format = replace_old_option(("--arrangement", arrangement), ("--format", format))
-    with _saying_stopped(out):
-        job = VideoJob(
-            depth=depth,
-            depth10=depth10,
-            depth16=depth16,
-            position=position,
-            layout=layout,
-            bits=bits,
-            strength=1.0 if strength is None else strength,
-            convergence_px=convergence,
-            screen=make_screen_choice(screen, strength, convergence),
-            rectify=rectify,
-            backend=Backend(model=model, threads=threads, provider=provider),
-            name_of=running_options(),
-        )
-        length_s = None if preview is None else _parse_length_s(preview)
-        source = open_video(
-            videos,
-            format,
-            rate=None if rate is None else _parse_rate(rate),
-            sphere=make_sphere_request(projection, look, fov, lens_fov, whole),
-        )
-        _convert(source, videos, out, job, length_s)
+    job = VideoJob(
+        depth=depth,
+        depth10=depth10,
+        depth16=depth16,
+        position=position,
+        layout=layout,
+        bits=bits,
+        strength=1.0 if strength is None else strength,
+        convergence_px=convergence,
+        screen=make_screen_choice(screen, strength, convergence),
+        rectify=rectify,
+        backend=Backend(model=model, threads=threads, provider=provider),
+        name_of=running_options(),
+    )
+    length_s = None if preview is None else _parse_length_s(preview)
+    source = open_video(
+        videos,
+        format,
+        rate=None if rate is None else _parse_rate(rate),
+        sphere=make_sphere_request(projection, look, fov, lens_fov, whole),
+    )
+    _convert(source, videos, out, job, length_s)
 
 
 def _convert(
@@ -206,8 +205,11 @@ def _convert(
     """Convert a video, or this much from its middle, and print what was done."""
     from rich.console import Console
 
+    from stereoweave.io.animation import require_video_extra
     from stereoweave.system.progress import format_duration
-    from stereoweave.video.convert import convert_video
+
+    with require_video_extra("a video"):
+        from stereoweave.video.convert import convert_video
 
     whole_count = video.frame_count
     if length_s is not None:
