@@ -47,7 +47,7 @@ _MEGAPIXELS_AT_ONCE = 32
 _MOST_QUEUED = 200
 # A replica starts in seconds; the first replica on a machine also compiles the kernels.
 _TRIAL_LIMIT_S = 120
-# As long as Ray Serve waits for its proxies. By default it kills one after 5 s, which a busy machine needs.
+# As long as Ray Serve waits for its proxies. By default it kills one after 5 s, too soon on a busy machine.
 _PROXY_START_LIMIT_S = 60
 _LOGGING = LoggingConfig(log_level="ERROR", enable_access_log=False)
 
@@ -258,7 +258,7 @@ def _start_proxies(host: str, port: int) -> None:
             controller_options={"runtime_env": {"env_vars": limit}},
         )
     except (RayActorError, TimeoutError) as error:
-        found = str(error).splitlines()[0].rstrip(".")
+        found = (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
         raise StereoweaveError(
             f"Ray Serve: expected HTTP proxies that are ready within {_PROXY_START_LIMIT_S} s, found: {found}"
             "; is a machine of the cluster overloaded?"
