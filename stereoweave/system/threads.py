@@ -46,7 +46,7 @@ def in_bands(work: Callable[[int, int], None], height: int, count: int, threads:
 
 
 def beyond_ctrl_c(work: Callable[[], Result]) -> Result:
-    """Return what `work` returns, from a thread of its own.
+    """Return what `work` returns, from a thread of its own. An interrupt waits until `work` has ended.
 
     Python raises KeyboardInterrupt in the main thread alone. There, it may come between the taking of a lock
     and the block that releases it; the lock is then held for as long as anyone holds the error.

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from stereoweave.matching.refine_kernels import census
-from stereoweave.system import kernel_cache, shipped_kernels
+from stereoweave.system import kernel_cache, shipped_kernels, threads
 from stereoweave.system.jit import Kernel
 from stereoweave.system.kernel_cache import kernels_folder
 from stereoweave.system.shipped_kernels import FOLDER, INDEX, bitcode_platform, flatten, sources_digest
@@ -60,10 +60,9 @@ def test_arrays_for_which_no_code_ships_are_told_apart():
 
 ROUGH = """
 import sys
-import threading
 import numpy as np
 from pathlib import Path
-from stereoweave.system import kernel_cache, shipped_kernels
+from stereoweave.system import shipped_kernels
 {}
 from stereoweave.matching.refine_kernels import census
 codes = np.zeros((1, 2), np.uint32)
@@ -148,12 +147,12 @@ def test_shipped_code_knows_no_processor():
     assert b"target-cpu" not in code
 
 
-def interrupt_at_line(number, file):
-    """Return a trace function that raises KeyboardInterrupt, once, at that line run of a source file."""
+def interrupt_at_line(number, files):
+    """Return a trace function that raises KeyboardInterrupt, once, at that line run of source files."""
     left = iter(range(number, -1, -1))
 
     def trace(frame, event, _):
-        if frame.f_code.co_filename != file:
+        if frame.f_code.co_filename not in files:
             return None
         if event == "line" and next(left, None) == 0:
             raise KeyboardInterrupt
@@ -167,16 +166,21 @@ def test_a_loading_that_ctrl_c_interrupts_anywhere_keeps_no_other_thread_waiting
     """At the end of a command, other threads may still compile while the error is on its way."""
     image, codes = np.array([[3, 5]], np.uint8), np.zeros((1, 2), np.uint32)
     Kernel(census.__wrapped__)(image, codes)
+    files = {module.__file__ for module in (kernel_cache, shipped_kernels, threads)}
     tracer = sys.gettrace()
-    for number in range(30):
+    interrupted = 0
+    for number in range(60):
+        run_kernel = Kernel(census.__wrapped__)
         try:
-            sys.settrace(interrupt_at_line(number, kernel_cache.__file__))
-            Kernel(census.__wrapped__)(image, codes)
+            sys.settrace(interrupt_at_line(number, files))
+            run_kernel(image, codes)
         except KeyboardInterrupt:
             sys.settrace(tracer)
+            interrupted += 1
             other = threading.Thread(target=Kernel(census.__wrapped__), args=[image, codes])
             other.start()
-            other.join(5)
+            other.join(20)
             assert not other.is_alive(), number
         finally:
             sys.settrace(tracer)
+    assert 10 < interrupted < 60
