@@ -122,7 +122,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: p
 
 @pytest.fixture
 def untraced() -> Iterator[None]:
-    """Run a test of processor time without the tracer of coverage, which takes two thirds of it."""
+    """Run a test of processor time without the tracer of coverage (see `tracing`)."""
     with without_tracer():
         yield
 

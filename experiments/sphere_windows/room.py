@@ -1,4 +1,4 @@
-"""A room rendered by plain ray casting for VR180 and 360-degree cameras, with exact distances."""
+"""A room rendered by ray casting for VR180 and 360-degree cameras, also the scene of the tests."""
 
 from typing import NamedTuple
 

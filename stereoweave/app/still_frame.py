@@ -26,7 +26,7 @@ class StillFrame:
     Attributes:
         pictures: Small pictures of the frame.
         last_s: Time of the video's last frame in seconds, rounded down to a tenth.
-        facts: What the video is, in the form's words.
+        facts: Notes on its views and colours, in the form's words.
         warnings: What is wrong with the frame, likewise.
     """
 

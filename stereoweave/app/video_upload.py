@@ -58,7 +58,7 @@ class VideoUpload:
 
 @dataclass(frozen=True)
 class ConvertedVideo:
-    """A converted video: its file, a line about it, what its source is, and warnings."""
+    """A converted video: its file, a line about it, notes on its views and colours, and warnings."""
 
     file: Path
     summary: str

@@ -25,8 +25,8 @@ Format = Annotated[
     str | None,
     typer.Option(
         "--format",
-        help="Frame packing, such as side_by_side or top_bottom_half (default: detected in the first "
-        "frame). An unknown name lists them all.",
+        help="Frame packing, such as side_by_side or top_bottom_half (default: as the file says, else "
+        "detected in the first frame). An unknown name lists them all.",
     ),
 ]
 Calib = Annotated[

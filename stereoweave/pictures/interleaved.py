@@ -13,8 +13,8 @@ from stereoweave.pictures.anaglyphs import MOVED_SHARE, extract_detail, measure_
 # Cubic interpolation between pixels of one view: the nearest ones are 1 px away, the next ones 3 px.
 _BETWEEN = np.array([-1, 0, 9, 0, 9, 0, -1], np.float32) / 16
 _REACH = len(_BETWEEN) // 2
-# At this size, 10 of 12 real pairs are suspected if interleaved by rows or as a checkerboard, 11 if by
-# columns; none of their 24 pictures is (`python -m experiments.interleaved`).
+# At this size, of 12 real pairs 10 are named rightly if interleaved by rows or as a checkerboard, 11 if by
+# columns; none of their 24 pictures is suspected (`python -m experiments.interleaved`).
 _LONGER_SIDE_PX = 320
 
 

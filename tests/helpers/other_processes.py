@@ -11,7 +11,7 @@ from typing import Any
 import psutil
 
 # Environment of processes whose coverage is not measured: of killed ones, which do not write it, and of
-# those that run what other tests measure. The tracer takes a fifth to a half of their time.
+# those that run what other tests measure. For what it costs, see `tracing`.
 UNMEASURED = {"COVERAGE_PROCESS_CONFIG": ""}
 # Python's options to run the command `stereoweave` in a process that is measured, but not its children: it
 # has started the tracer before it empties the variable.

@@ -6,14 +6,11 @@ import pytest
 from PIL import Image
 
 from experiments.sphere_windows.room import cast, look_equirectangular, render_fixed, render_turning
-from stereoweave.cameras.sphere_nearness import MatchedWindow, spread_nearness
-from stereoweave.cameras.sphere_windows import make_whole_window, make_window
 from stereoweave.cameras.spherical import Projection, SphereRequest
 from stereoweave.cli.root import main
 from stereoweave.pictures.loading import open_pictures
 
 HALF = Projection.named("half_equirectangular")
-FULL = Projection.named("equirectangular")
 
 
 def run(*words):
@@ -67,45 +64,6 @@ def test_distances_all_around_are_right_and_have_no_seam(tmp_path, capsys):
     steps = np.abs(1 / np.roll(found, 1, axis=1) - 1 / found)[100:284]
     # Column 0 follows the last one, behind the camera.
     assert np.median(steps[:, 0]) < 3 * np.median(steps)
-
-
-@pytest.mark.parametrize("look_deg", [(0, 0), (25, 0), (0, 25)])
-def test_exact_distances_of_a_window_are_exact_in_all_its_directions(look_deg):
-    window = make_window(HALF, (256, 256), look_deg, 60)
-    rays = np.moveaxis(window.rays().astype(float), 0, -1)
-    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-    _, distance = cast(rays, np.array([-0.5, 0, 0]))
-    certain = np.ones(distance.shape, np.float32)
-    found = spread_nearness(
-        MatchedWindow(window, (1 / distance).astype(np.float32), certain), HALF, (256, 256)
-    )
-    _, distance = cast(look_equirectangular((256, 256)), np.array([-0.5, 0, 0]))
-    known = ~np.isnan(found.nearness)
-    yaw, pitch = look_deg
-    # 256 px are 180 degrees.
-    middle = 128 - round(256 * pitch / 180), 128 + round(256 * yaw / 180)
-    assert known[middle] and not known[middle[0], middle[1] - 60]
-    np.testing.assert_allclose(1 / found.nearness[known], distance[known], rtol=0.03)
-
-
-def test_both_ends_of_a_circle_are_weighted_by_confidence():
-    window = make_whole_window(FULL, (256, 128))
-    width_px, height_px = window.size_px
-    left_end = np.broadcast_to(np.arange(width_px) < width_px / 2, (height_px, width_px))
-    nearness, confidence = (np.where(left_end, *ends).astype(np.float32) for ends in ((0.1, 0.3), (0.9, 0.1)))
-    found = spread_nearness(MatchedWindow(window, nearness, confidence), FULL, (256, 128))
-    # Behind the camera, both ends are as far from their borders: 0.9 * 0.1 + 0.1 * 0.3, and 0.9**2 + 0.1**2.
-    assert found.nearness[64, [0, -1]] == pytest.approx(0.12, abs=0.005)
-    assert found.confidence[64, [0, -1]] == pytest.approx(0.82, abs=0.02)
-
-
-def test_what_the_pictures_do_not_cover_is_unknown():
-    window = make_whole_window(FULL, (256, 128))
-    flat = np.ones((window.size_px[1], window.size_px[0]), np.float32)
-    seen = flat > 0
-    seen[: window.size_px[1] // 2] = False
-    found = spread_nearness(MatchedWindow(window, flat, flat, seen), FULL, (256, 128))
-    assert np.isnan(found.nearness[:60]).all() and not np.isnan(found.nearness[68:110]).any()
 
 
 def test_views_of_the_whole_are_vr180_again(tmp_path):

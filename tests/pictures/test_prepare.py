@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from stereoweave.cameras.alignment import check_pair
 from stereoweave.io.images import read_image
 from stereoweave.pictures.prepare import Request, prepare
 
@@ -54,3 +55,13 @@ def test_a_converged_lens_gives_no_metres(testdata):
     prepared = prepare([testdata / "consumer" / "Panasonic-DMC-GX8.mpo"], Request())
     assert prepared.pair.camera is None
     assert str(prepared.notes[-1]) == "no depth in metres: 82" + NO_DOFFS
+
+
+@pytest.mark.testdata
+def test_a_pair_of_a_vr180_camera_is_aligned(testdata):
+    prepared = prepare([testdata / "consumer" / "calf-left-right.jpg"], Request())
+    assert str(prepared.notes[0]).startswith("side_by_side, detected from name and content")
+    assert prepared.pair.left.shape == (1080, 1920, 3)
+    # The rows of the file are 2.6 px apart.
+    found = check_pair(prepared.pair.left, prepared.pair.right)
+    assert found.vertical_error_px < 0.3 and found.vertical_error_95_px < 1 and not found.defects

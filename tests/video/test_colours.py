@@ -3,18 +3,11 @@ from fractions import Fraction
 import av
 import numpy as np
 import pytest
+from hdr_examples import BT709, BT2020, HLG, PQ, nit_codes, srgb
 from video_examples import example_pairs, packed
 
 from stereoweave.video.colours import convert_to_rgb
 from stereoweave.video.reader import open_video
-
-PQ, HLG, BT2020, BT709 = 16, 18, 9, 1
-
-
-def nit_codes(*rgb_nits):
-    """Return the PQ codes of three luminances (SMPTE ST 2084)."""
-    power = (np.array(rgb_nits) / 10_000) ** (2610 / 16384)
-    return ((3424 / 4096 + 2413 / 128 * power) / (1 + 2392 / 128 * power)) ** (2523 / 32)
 
 
 def hdr_frame(rgb_codes, transfer, primaries=BT2020):
@@ -38,42 +31,12 @@ def shown(rgb_codes, transfer, primaries=BT2020):
     return picture[0, 0].astype(int).tolist()
 
 
-def srgb(light):
-    return round(255 * (1.055 * light ** (1 / 2.4) - 0.055))
-
-
-@pytest.mark.parametrize("nits", [5, 26, 58, 90])
-def test_luminance_below_the_knee_of_bt2390_is_kept(nits):
-    # The knee is at 1.5 * 0.581 - 0.5 * 0.752 = 0.495 in PQ, 92 cd/m2; SDR's white is 203.
-    assert shown(nit_codes(nits, nits, nits), PQ) == pytest.approx(3 * [srgb(nits / 203)], abs=1)
-
-
-def test_highlights_are_compressed_up_to_1000_nits():
-    greys = [shown(nit_codes(nits, nits, nits), PQ)[1] for nits in (90, 203, 400, 700, 1000, 4000)]
-    assert greys == sorted(greys)
-    assert greys[-2:] == [255, 255]
-    # By hand, by the spline of BT.2390: 203 cd/m2 is PQ 0.5807, a share of 0.7724 of the range to 1000 cd/m2;
-    # with the knee at 0.6586, t = 0.3333, so the share becomes 0.6586 * 0.7408 + 0.3414 * 0.1482 +
-    # 0.7724 * 0.2592 = 0.7387, PQ 0.5554, 159 cd/m2: 0.784 of SDR's white.
-    assert greys[1] == pytest.approx(srgb(0.784), abs=1)
-
-
 def test_hlg_and_pq_show_the_same_white_and_grey_card():
     # BT.2408: white at 203 cd/m2 is 75 % HLG, the grey card at 26 cd/m2 is 38 %.
     assert shown((0.75, 0.75, 0.75), HLG) == pytest.approx(shown(nit_codes(203, 203, 203), PQ), abs=1)
     assert shown((0.38, 0.38, 0.38), HLG) == pytest.approx(shown(nit_codes(26, 26, 26), PQ), abs=2)
     assert shown((0, 0, 0), HLG) == [0, 0, 0]
     assert shown((1, 1, 1), HLG) == [255, 255, 255]
-
-
-@pytest.mark.parametrize(
-    ("channel", "column"), [(0, (0.6274, 0.0691, 0.0164)), (2, (0.0433, 0.0114, 0.8956))]
-)
-def test_primaries_of_bt709_stay_pure(channel, column):
-    # The columns are BT.709's red and blue in BT.2020 (BT.2087), here at 80 cd/m2.
-    expected = [0, 0, 0]
-    expected[channel] = srgb(80 / 203)
-    assert shown(nit_codes(*(80 * share for share in column)), PQ) == pytest.approx(expected, abs=4)
 
 
 def test_hdr_with_the_primaries_of_bt709_keeps_them():
