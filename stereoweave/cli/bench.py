@@ -347,7 +347,8 @@ def _draw_plots(
     if plot:
         benchmark_plots.draw_error_over_time(plot, means)
     if sparsification:
-        benchmark_plots.draw_sparsification(sparsification, curves)
+        checked = [row.matcher for row in means if benchmark_plots.is_checked(row)]
+        benchmark_plots.draw_sparsification(sparsification, curves, checked)
 
 
 def _write_classes(file: Path, scores: Any) -> None:
