@@ -102,6 +102,10 @@ def test_a_stopped_run_says_how_to_resume_and_resumes(folder, capfd, monkeypatch
 @pytest.mark.parametrize(
     ("options", "line"),
     [
+        (
+            "kitti --dataset middlebury_v3",
+            "kitti: expected pictures of one resolution, found none; unpack MiddEval3's archives there",
+        ),
         ("nowhere", "nowhere: expected a dataset folder, found no such folder"),
         (".", ".: expected the unpacked archives of a benchmark, with the folder testing/image_0 or "),
         (
