@@ -83,7 +83,6 @@ NAMES = {
     "psmnet": "PSMNet",
     "scvnet": "SCV-Net",
     "ganet_11": "GA-Net-11",
-    "ganet_deep": "GA-Net-deep",
     "fast_depth": "the paper's network",
 }
 # Index of the only column whose target is depth.

@@ -110,6 +110,16 @@ def make_matcher(
     return lambda pair: match(matcher, pair, options)
 
 
+def merge_makers(*groups: Mapping[str, MatcherFactory]) -> dict[str, MatcherFactory]:
+    """Return the factories of all groups. Raises StereoweaveError if two groups share a name."""
+    merged: dict[str, MatcherFactory] = {}
+    for group in groups:
+        if shared := [name for name in group if name in merged]:
+            raise _refuse_duplicate(shared[0])
+        merged |= group
+    return merged
+
+
 def score_pairs(
     makers: Mapping[str, MatcherFactory], scenes: SceneLister[Scene], engine: Engine | None = None
 ) -> PairScores:
@@ -210,10 +220,14 @@ class _SceneScorer:
 def _add_opencv(makers: Mapping[str, MatcherFactory]) -> dict[str, MatcherFactory]:
     for name in makers:
         if Path(name).stem in (*OPENCV_MATCHERS, MEAN):
-            raise StereoweaveError(
-                f"{name}: expected a name that no other row of the table uses, found a duplicate; rename it"
-            )
+            raise _refuse_duplicate(name)
     return {**OPENCV_MATCHERS, **makers}
+
+
+def _refuse_duplicate(name: str) -> StereoweaveError:
+    return StereoweaveError(
+        f"{name}: expected a name that no other row of the table uses, found a duplicate; rename it"
+    )
 
 
 def _score_scene(matchers: Mapping[str, MatchFunction], scene: Scene) -> _SceneScores:

@@ -1,7 +1,7 @@
 """Plots of `stereoweave bench pairs`: errors against time, and sparsification curves."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,9 +13,7 @@ from matplotlib.text import Annotation
 from matplotlib.ticker import FormatStrFormatter, LogLocator, NullLocator
 from matplotlib.transforms import Bbox
 
-from stereoweave.bench.classical.matchers import CLASSICAL_MATCHERS
 from stereoweave.bench.metrics import DROPPED_PERCENT, Sparsification
-from stereoweave.bench.opencv_matchers import OPENCV_MATCHERS
 from stereoweave.bench.tables import Curves, MatcherRow
 from stereoweave.io.images import write_image
 
@@ -31,6 +29,11 @@ _PLACES: tuple[_Place, ...] = (
     ((7, 0), "left", "center"),
     ((-7, 0), "right", "center"),
 )
+
+
+def is_checked(row: MatcherRow) -> bool:
+    """Return whether a matcher's confidence is the left-right check, which has no calibration error."""
+    return math.isnan(row.calibration_error)
 
 
 def draw_error_over_time(path: str | Path, rows: Sequence[MatcherRow]) -> None:
@@ -58,19 +61,21 @@ def draw_error_over_time(path: str | Path, rows: Sequence[MatcherRow]) -> None:
     _save(figure, path)
 
 
-def draw_sparsification(path: str | Path, curves: Mapping[str, Curves]) -> None:
+def draw_sparsification(path: str | Path, curves: Mapping[str, Curves], checked: Collection[str]) -> None:
     """Write plots of bad-1 and EPE against the share of pixels dropped by confidence, with dashed oracles.
 
     Args:
         path: Picture to write; its extension selects the format.
         curves: Curves of `score_pairs`, by matcher.
+        checked: Names of the matchers whose confidence is the left-right check.
     """
     figure, panels = _make_panels()
     for column, axes in panels.items():
         for index, (name, of_matcher) in enumerate(curves.items()):
             curve: Sparsification = getattr(of_matcher, column)
             colour = _COLOURS[index % len(_COLOURS)]
-            axes.plot(DROPPED_PERCENT, curve.kept, color=colour, linewidth=2, label=_legend_entry(name))
+            label = f"{name}, by its left-right check" if name in checked else _short_name(name)
+            axes.plot(DROPPED_PERCENT, curve.kept, color=colour, linewidth=2, label=label)
             axes.plot(DROPPED_PERCENT, curve.oracle, color=colour, linewidth=1, linestyle="--")
         axes.set(xlabel="dropped, % of pixels", ylabel=_TITLES[column], xlim=(0, 95), ylim=(0, None))
     axes.plot([], [], color="0.4", linewidth=1, linestyle="--", label="by the true error: the oracle")
@@ -89,18 +94,13 @@ def _make_panels() -> tuple[Figure, dict[str, Axes]]:
 
 
 def _choose_marker(row: MatcherRow) -> dict[str, Any]:
-    if row.matcher in (*OPENCV_MATCHERS, *CLASSICAL_MATCHERS):
+    if is_checked(row):
         return {"marker": "s", "color": "0.45", "linestyle": ""}
     return {"marker": "o", "color": _COLOURS[0], "linestyle": ""}
 
 
 def _short_name(matcher: str) -> str:
     return Path(matcher).name
-
-
-def _legend_entry(matcher: str) -> str:
-    checked = matcher in (*OPENCV_MATCHERS, *CLASSICAL_MATCHERS)
-    return f"{matcher}, by its left-right check" if checked else _short_name(matcher)
 
 
 def _label(axes: Axes, points: Mapping[str, tuple[float, float]]) -> None:

@@ -119,7 +119,7 @@ def pairs(  # noqa: PLR0913 - each is an option of the command line
 
     from stereoweave.bench.classical.matchers import make_classical_matcher
     from stereoweave.bench.opencv_matchers import SGBM
-    from stereoweave.bench.pairs import add_memory, score_pairs
+    from stereoweave.bench.pairs import add_memory, merge_makers, score_pairs
     from stereoweave.bench.tables import MEAN, write_csv
     from stereoweave.data.readers import list_scenes
     from stereoweave.system.threads import thread_count
@@ -130,12 +130,11 @@ def pairs(  # noqa: PLR0913 - each is an option of the command line
     engine = make_engine(cluster, cpus_each=threads or 1)
     threads = engine.threads_each if engine else threads
     cv2.setNumThreads(thread_count(threads))
-    makers: dict[str, Callable[[], Any]] = {
-        name: partial(make_classical_matcher, name) for name in matchers or ()
-    }
-    makers |= _list_mc_cnns(mc_cnn or [], threads)
-    if model or not makers:
-        makers |= _list_makers(model, threads, provider)
+    makers = merge_makers(
+        {name: partial(make_classical_matcher, name) for name in matchers or ()},
+        _list_mc_cnns(mc_cnn or [], threads),
+        _list_makers(model, threads, provider) if model or not (matchers or mc_cnn) else {},
+    )
     scores = score_pairs(makers, partial(list_scenes, folder.absolute(), dataset), engine)
     rows = add_memory(scores.rows, makers, scores.largest)
     write_csv(out, rows, scores.machine)
@@ -348,7 +347,8 @@ def _draw_plots(
     if plot:
         benchmark_plots.draw_error_over_time(plot, means)
     if sparsification:
-        benchmark_plots.draw_sparsification(sparsification, curves)
+        checked = [row.matcher for row in means if benchmark_plots.is_checked(row)]
+        benchmark_plots.draw_sparsification(sparsification, curves, checked)
 
 
 def _write_classes(file: Path, scores: Any) -> None:

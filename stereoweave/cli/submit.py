@@ -1,6 +1,6 @@
 """The command `stereoweave bench submit`."""
 
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,54 +15,60 @@ if TYPE_CHECKING:
 _MOST_PROBLEMS = 20
 
 
+BenchmarkFolder = Annotated[
+    Path,
+    typer.Argument(
+        help="Folder of the unpacked archives of KITTI 2012, KITTI 2015, Middlebury v3 or ETH3D two-view."
+    ),
+]
+ArchiveFile = Annotated[Path, typer.Option("--out", "-o", help="Archive to write, a new .zip file.")]
+BenchmarkName = Annotated[
+    str | None,
+    typer.Option(
+        help="Benchmark: kitti2012, kitti2015, middlebury_v3 or eth3d (default: detected from the folder)."
+    ),
+]
+TrainingOnly = Annotated[
+    bool,
+    typer.Option(
+        "--training-only",
+        help="Leave out the test pairs. Middlebury and ETH3D accept that; KITTI takes test pairs only.",
+    ),
+]
+Resolution = Annotated[
+    str | None,
+    typer.Option(
+        metavar="LETTER",
+        help="Size of Middlebury's pictures, F, H or Q (default: the only one in the folder).",
+    ),
+]
+Method = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME", help="Name of the method in Middlebury's file names (default: Stereoweave)."
+    ),
+]
+CheckedArchive = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="ARCHIVE",
+        help="Check an archive, written by this command or another program, and write nothing. The exit "
+        "status is 1 if its site would not accept it.",
+    ),
+]
+
+
 @shows_steps
 def submit(  # noqa: PLR0913 - each is an option of the command line
-    folder: Annotated[
-        Path,
-        typer.Argument(
-            help="Folder of the unpacked archives of KITTI 2012, KITTI 2015, Middlebury v3 or ETH3D two-view."
-        ),
-    ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Archive to write, a new .zip file.")] = Path(
-        "submission.zip"
-    ),
+    folder: BenchmarkFolder,
+    out: ArchiveFile = Path("submission.zip"),
     model: Model = "best",
     refined: Refined = False,
-    dataset: Annotated[
-        str | None,
-        typer.Option(
-            help="Benchmark: kitti2012, kitti2015, middlebury_v3 or eth3d (default: detected from the "
-            "folder)."
-        ),
-    ] = None,
-    training_only: Annotated[
-        bool,
-        typer.Option(
-            "--training-only",
-            help="Leave out the test pairs. Middlebury and ETH3D accept that; KITTI takes test pairs only.",
-        ),
-    ] = False,
-    resolution: Annotated[
-        str | None,
-        typer.Option(
-            metavar="LETTER",
-            help="Size of Middlebury's pictures, F, H or Q (default: the only one in the folder).",
-        ),
-    ] = None,
-    method: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME", help="Name of the method in Middlebury's file names (default: Stereoweave)."
-        ),
-    ] = None,
-    check: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="ARCHIVE",
-            help="Check an archive, written by this command or another program, and write nothing. The exit "
-            "status is 1 if its site would not accept it.",
-        ),
-    ] = None,
+    dataset: BenchmarkName = None,
+    training_only: TrainingOnly = False,
+    resolution: Resolution = None,
+    method: Method = None,
+    check: CheckedArchive = None,
     threads: Threads = None,
     provider: Provider = "cpu",
 ) -> None:
@@ -86,7 +92,8 @@ def submit(  # noqa: PLR0913 - each is an option of the command line
         return
     submission = Submission(dataset=name, pairs=pairs, method=method or DEFAULT_METHOD)
     check_new_archive(out)
-    _warn(submission)
+    for note in _list_missing(submission):
+        typer.echo(f"stereoweave: warning: {note}", err=True)
     backend = Backend(model=model, threads=threads, provider=provider)
     try:
         written = write_submission(out, submission, backend, refined=refined, console=Console(stderr=True))
@@ -101,11 +108,11 @@ def submit(  # noqa: PLR0913 - each is an option of the command line
     )
 
 
-def _warn(submission: "Submission") -> None:
+def _list_missing(submission: "Submission") -> list[str]:
     from stereoweave.data.benchmarks import describe_missing_pairs
 
-    for note in describe_missing_pairs(submission.dataset, submission.pairs):
-        typer.echo(f"stereoweave: warning: {note.format(running_options())}", err=True)
+    notes = describe_missing_pairs(submission.dataset, submission.pairs)
+    return [note.format(running_options()) for note in notes]
 
 
 def _check(archive: Path, submission: "Submission") -> None:
@@ -113,8 +120,7 @@ def _check(archive: Path, submission: "Submission") -> None:
     from stereoweave.bench.submission_check import find_problems
     from stereoweave.data.benchmarks import BENCHMARKS
 
-    _warn(submission)
-    problems = find_problems(archive, submission)
+    problems = chain(_list_missing(submission), find_problems(archive, submission))
     shown = list(islice(problems, _MOST_PROBLEMS))
     more = sum(1 for _ in problems)
     if shown:

@@ -22,66 +22,75 @@ Scene = Annotated[str, typer.Argument(help=f"One of {', '.join(SCENE_NAMES)}.")]
 Jobs = Annotated[int | None, typer.Option(min=1, help="Number of processes (default: all cores).")]
 
 
+NewSet = Annotated[
+    Path, typer.Option("--out", "-o", help="Folder of the set: a new one, or one to resume or extend.")
+]
+Pairs = Annotated[
+    int | None, typer.Option(min=1, help="Number of pairs in the finished set, unless --worlds is given.")
+]
+Worlds = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        help="Number of worlds in the finished set, each with one video of --frames pairs from a camera "
+        "that keeps moving around the target; the set also holds the camera's poses.",
+    ),
+]
+Seed = Annotated[int, typer.Option(min=0, help="Random seed.")]
+Size = Annotated[str, typer.Option(help="Width and height in pixels.")]
+Plain = Annotated[
+    bool, typer.Option("--plain", help="Render faster, without shadows, gloss or other effects.")
+]
+Layout = Annotated[
+    str, typer.Option(help="Layout of the set: shards (tar files), or paper (folders left, right and depth).")
+]
+Frames = Annotated[
+    int, typer.Option(min=1, help="Number of pairs per video from a moving camera; 1 makes stills.")
+]
+Views = Annotated[
+    list[float] | None,
+    typer.Option(
+        help="Position of an additional view, from -1 to 2; 0.5 is halfway between the cameras. Repeatable."
+    ),
+]
+Rig = Annotated[
+    tuple[float, float] | None,
+    typer.Option(
+        metavar="FOCAL_PX BASELINE_M",
+        help="Focal length in pixels and baseline in metres of all pairs (default: random for each "
+        "pair; with --worlds, 0.825 times the width, and 0.5 m).",
+    ),
+]
+Distance = Annotated[
+    tuple[float, float] | None,
+    typer.Option(
+        metavar="NEAR_M FAR_M",
+        help="With --worlds, least and greatest distance of the cameras from the target's centre in "
+        "metres (default: the nearer half of the scene's).",
+    ),
+]
+ShardJobs = Annotated[
+    int | None,
+    typer.Option(min=1, help="Number of processes (default: all cores); each makes shards of 50 pairs."),
+]
+
+
 @synth.command()
 @shows_steps
 def make(  # noqa: PLR0913 - each is an option of the command
     scene: Scene,
-    out: Annotated[
-        Path, typer.Option("--out", "-o", help="Folder of the set: a new one, or one to resume or extend.")
-    ],
-    pairs: Annotated[
-        int | None, typer.Option(min=1, help="Number of pairs in the finished set, unless --worlds is given.")
-    ] = None,
-    worlds: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            help="Number of worlds in the finished set, each with one video of --frames pairs from a camera "
-            "that keeps moving around the target; the set also holds the camera's poses.",
-        ),
-    ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 0,
-    size: Annotated[str, typer.Option(help="Width and height in pixels.")] = "640x480",
-    plain: Annotated[
-        bool, typer.Option("--plain", help="Render faster, without shadows, gloss or other effects.")
-    ] = False,
-    layout: Annotated[
-        str,
-        typer.Option(help="Layout of the set: shards (tar files), or paper (folders left, right and depth)."),
-    ] = "shards",
-    frames: Annotated[
-        int, typer.Option(min=1, help="Number of pairs per video from a moving camera; 1 makes stills.")
-    ] = 1,
-    view: Annotated[
-        list[float] | None,
-        typer.Option(
-            help="Position of an additional view, from -1 to 2; 0.5 is halfway between the cameras. "
-            "Repeatable."
-        ),
-    ] = None,
-    rig: Annotated[
-        tuple[float, float] | None,
-        typer.Option(
-            metavar="FOCAL_PX BASELINE_M",
-            help="Focal length in pixels and baseline in metres of all pairs (default: random for each "
-            "pair; with --worlds, 0.825 times the width, and 0.5 m).",
-        ),
-    ] = None,
-    distance: Annotated[
-        tuple[float, float] | None,
-        typer.Option(
-            metavar="NEAR_M FAR_M",
-            help="With --worlds, least and greatest distance of the cameras from the target's centre in "
-            "metres (default: the nearer half of the scene's).",
-        ),
-    ] = None,
-    jobs: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            help="Number of processes (default: all cores); each makes shards of 50 pairs.",
-        ),
-    ] = None,
+    out: NewSet,
+    pairs: Pairs = None,
+    worlds: Worlds = None,
+    seed: Seed = 0,
+    size: Size = "640x480",
+    plain: Plain = False,
+    layout: Layout = "shards",
+    frames: Frames = 1,
+    view: Views = None,
+    rig: Rig = None,
+    distance: Distance = None,
+    jobs: ShardJobs = None,
     cluster: Cluster = None,
 ) -> None:
     """Render a set of pairs, or resume or extend an existing one."""

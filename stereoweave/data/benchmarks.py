@@ -193,9 +193,13 @@ def _find_resolution(base: Path, chosen: str | None) -> str:
     ]
     if chosen is not None:
         return chosen
-    if len(found) != 1:
+    if not found:
         raise StereoweaveError(
-            f"{base}: expected pictures of one resolution, found {' and '.join(found) or 'none'}",
+            f"{base}: expected pictures of one resolution, found none; unpack MiddEval3's archives there"
+        )
+    if len(found) > 1:
+        raise StereoweaveError(
+            f"{base}: expected pictures of one resolution, found {' and '.join(found)}",
             remedy=Remedy("choose one", ("resolution",)),
         )
     return found[0]

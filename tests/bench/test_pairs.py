@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from stereoweave.bench.opencv_matchers import OPENCV_MATCHERS
-from stereoweave.bench.pairs import TURNS, add_memory, make_matcher, score_pairs
+from stereoweave.bench.pairs import TURNS, add_memory, make_matcher, merge_makers, score_pairs
 from stereoweave.bench.tables import MEAN, write_csv
 from stereoweave.data.readers import Scene
 from stereoweave.errors import MatcherError, StereoweaveError
@@ -117,6 +117,14 @@ def test_times_are_relative_to_sgbm_in_the_same_row(rng):
 def test_a_matcher_with_the_name_of_another_row_is_refused(rng, name):
     with pytest.raises(StereoweaveError, match=f"{name}: expected"):
         scores_of({name: constant(1.0)}, [scene_of(rng)])
+
+
+def test_groups_of_matchers_become_one_unless_two_share_a_name():
+    one, two, three = constant(1.0), constant(2.0), constant(3.0)
+    merged = merge_makers({"a": one}, {}, {"b": two, "c": three})
+    assert list(merged.items()) == [("a", one), ("b", two), ("c", three)]
+    with pytest.raises(StereoweaveError, match="b: expected a name that no other row of the table uses"):
+        merge_makers({"a": one, "b": two}, {"b": three})
 
 
 def test_matchers_take_turns_after_the_calls_that_warm_them_up(rng):

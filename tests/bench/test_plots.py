@@ -27,15 +27,15 @@ def drawn(monkeypatch):
     return figures
 
 
-def row(matcher, time_ms, bad1_percent, epe_px):
-    others = dict.fromkeys(("bad2_percent", "d1_percent", "time_relative", "calibration_error"), math.nan)
+def row(matcher, time_ms, bad1_percent, epe_px, calibration_error=0.1):
+    others = dict.fromkeys(("bad2_percent", "d1_percent", "time_relative"), math.nan)
     edges = dict.fromkeys(("edge_epe_px", "edge_bad1_percent", "flying_percent"), math.nan)
     areas = dict.fromkeys(("ause_px", "ause_bad1_percent"), math.nan)
-    errors = {"epe_px": epe_px, "bad1_percent": bad1_percent}
+    errors = {"epe_px": epe_px, "bad1_percent": bad1_percent, "calibration_error": calibration_error}
     return MatcherRow(matcher=matcher, scene="mean", time_ms=time_ms, **errors, **others, **edges, **areas)
 
 
-ROWS = [row("sgbm", 70, 17, 2.3), row("small", 71, 17.1, 2.29), row("a/mine.onnx", 72, 17, 2.3)]
+ROWS = [row("sgbm", 70, 17, 2.3, math.nan), row("small", 71, 17.1, 2.29), row("a/mine.onnx", 72, 17, 2.3)]
 
 
 def test_each_matcher_is_a_point_in_both_panels_networks_apart_from_opencv(tmp_path, drawn):
@@ -51,6 +51,12 @@ def test_each_matcher_is_a_point_in_both_panels_networks_apart_from_opencv(tmp_p
     assert (tmp_path / "time.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_any_matcher_whose_confidence_is_no_probability_has_the_marker_of_opencv_s(tmp_path, drawn):
+    draw_error_over_time(tmp_path / "time.png", [*ROWS, row("mc_cnn raw", 90, 20, 3, math.nan)])
+    for axes in drawn[0].axes:
+        assert [line.get_marker() for line in axes.lines] == ["s", "o", "o", "s"]
+
+
 def test_names_of_nearly_coincident_points_do_not_overlap(tmp_path, drawn):
     draw_error_over_time(tmp_path / "time.png", ROWS)
     for axes in drawn[0].axes:
@@ -61,8 +67,8 @@ def test_names_of_nearly_coincident_points_do_not_overlap(tmp_path, drawn):
 
 def test_each_confidence_has_its_curve_and_its_oracle_in_one_colour(tmp_path, drawn, rng):
     curve = sparsification(rng.uniform(0, 3, 50), rng.uniform(0, 1, 50))
-    curves = {"small": Curves(curve, curve), "sgbm": Curves(curve, curve)}
-    draw_sparsification(tmp_path / "curves.png", curves)
+    curves = {"small": Curves(curve, curve), "mc_cnn raw": Curves(curve, curve)}
+    draw_sparsification(tmp_path / "curves.png", curves, checked={"mc_cnn raw"})
     for axes in drawn[0].axes:
         kept, oracle, other_kept, _ = axes.lines[:4]
         np.testing.assert_array_equal(kept.get_ydata(), curve.kept)
@@ -70,7 +76,7 @@ def test_each_confidence_has_its_curve_and_its_oracle_in_one_colour(tmp_path, dr
         np.testing.assert_array_equal(kept.get_xdata(), np.arange(96))
         assert kept.get_color() == oracle.get_color() != other_kept.get_color()
     legend = [text.get_text() for text in drawn[0].axes[1].get_legend().get_texts()]
-    assert legend == ["small", "sgbm, by its left-right check", "by the true error: the oracle"]
+    assert legend == ["small", "mc_cnn raw, by its left-right check", "by the true error: the oracle"]
 
 
 def test_a_matcher_of_unknown_error_is_left_out_and_any_kind_of_picture_is_written(tmp_path):

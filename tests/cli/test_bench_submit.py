@@ -1,10 +1,12 @@
 import zipfile
+from dataclasses import replace
 
 import pytest
 from benchmark_examples import write_constant_matcher, write_eth3d, write_kitti, write_middlebury
 
 from stereoweave.bench import submissions
 from stereoweave.cli.root import main
+from stereoweave.data.benchmarks import BENCHMARKS, TEST, TRAINING
 
 
 @pytest.fixture
@@ -18,24 +20,38 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
+def publish(monkeypatch, dataset, counts):
+    """Let a benchmark have as many pairs as its small download here."""
+    monkeypatch.setitem(BENCHMARKS, dataset, replace(BENCHMARKS[dataset], published=counts))
+
+
 def run(command: str) -> int:
     return main(["bench", "submit", *command.split()])
 
 
-def test_a_submission_is_written_and_checked_with_a_warning_about_missing_pairs(folder, capfd):
+def test_a_submission_is_written_with_a_warning_about_missing_pairs_which_a_check_counts_as_a_problem(
+    folder, capfd
+):
     assert run("kitti --model constant.onnx --threads 1") == 0
     printed, told = capfd.readouterr()
     assert printed.startswith("submission.zip: KITTI 2015, 2 pairs matched, ")
     assert printed.endswith(" s per pair\n")
     missing = "KITTI 2015 has 200 test pairs, found 2; the site will not accept the submission"
     assert told.splitlines()[0] == f"stereoweave: warning: {missing}"
+    assert run("kitti --check submission.zip") == 1
+    assert capfd.readouterr() == (f"{missing}\n", "")
+
+
+def test_a_complete_submission_is_as_its_site_expects_it(folder, capfd, monkeypatch):
+    publish(monkeypatch, "kitti2015", {TEST: 2})
+    assert run("kitti --model constant.onnx --threads 1") == 0
+    assert "warning" not in capfd.readouterr().err
     assert run("kitti --check submission.zip") == 0
-    printed, told = capfd.readouterr()
-    assert printed == "submission.zip: 2 pairs, as KITTI 2015 expects them\n"
-    assert told == f"stereoweave: warning: {missing}\n"
+    assert capfd.readouterr() == ("submission.zip: 2 pairs, as KITTI 2015 expects them\n", "")
 
 
-def test_the_training_pairs_of_one_size_are_a_submission_with_the_method_s_name(folder, capfd):
+def test_the_training_pairs_of_one_size_are_a_submission_with_the_method_s_name(folder, capfd, monkeypatch):
+    publish(monkeypatch, "middlebury_v3", {TRAINING: 1, TEST: 15})
     choice = "--training-only --method Weave --resolution Q --dataset middlebury_v3"
     assert run(f"middlebury --model constant.onnx --threads 1 {choice} -o out/weave.zip") == 0
     assert "out/weave.zip: Middlebury v3, 1 pair matched, " in capfd.readouterr().out
@@ -47,7 +63,8 @@ def test_the_training_pairs_of_one_size_are_a_submission_with_the_method_s_name(
     assert capfd.readouterr().out == "out/weave.zip: 1 pair, as Middlebury v3 expects them\n"
 
 
-def test_problems_have_a_line_each_and_exit_status_1(folder, capfd):
+def test_problems_have_a_line_each_and_exit_status_1(folder, capfd, monkeypatch):
+    publish(monkeypatch, "eth3d", {TRAINING: 1, TEST: 1})
     assert run("eth3d --model constant.onnx --threads 1 --training-only -o half.zip") == 0
     capfd.readouterr()
     assert run("eth3d --check half.zip") == 1
@@ -85,6 +102,10 @@ def test_a_stopped_run_says_how_to_resume_and_resumes(folder, capfd, monkeypatch
 @pytest.mark.parametrize(
     ("options", "line"),
     [
+        (
+            "kitti --dataset middlebury_v3",
+            "kitti: expected pictures of one resolution, found none; unpack MiddEval3's archives there",
+        ),
         ("nowhere", "nowhere: expected a dataset folder, found no such folder"),
         (".", ".: expected the unpacked archives of a benchmark, with the folder testing/image_0 or "),
         (

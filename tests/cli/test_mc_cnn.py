@@ -18,7 +18,7 @@ from stereoweave.learn.models.mc_cnn import MCCNN
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch):
-    """Work in a folder with a set of one pair and a file of random weights."""
+    """Work in a folder with a set of one pair, and files of random weights."""
     threads = torch.get_num_threads()
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "100")
@@ -26,7 +26,8 @@ def folder(tmp_path, monkeypatch):
         tmp_path / "ship", "ship", 0, [pack(box_before_a_wall(np.random.default_rng(0), (96, 64)), {})]
     )
     torch.manual_seed(0)
-    torch.save({"model": MCCNN().state_dict()}, tmp_path / "random.pt")
+    for name in ("random", "3dmst", "base"):
+        torch.save({"model": MCCNN().state_dict()}, tmp_path / f"{name}.pt")
     yield tmp_path
     torch.set_num_threads(threads)
 
@@ -59,6 +60,8 @@ def test_mc_cnn_has_a_row_for_each_set_of_steps_beside_opencv_s_matchers(folder,
         ("--mc-cnn missing.pt", "missing.pt: expected MC-CNN's weights, found no such file"),
         ("--mc-cnn ship", "ship: expected MC-CNN's weights in a PyTorch file, found "),
         ("--mc-cnn random.pt --mc-cnn ./random.pt", "random: expected weight files of different names"),
+        ("--mc-cnn 3dmst.pt --matchers 3dmst", "3dmst: expected a name that no other row of the table uses"),
+        ("--mc-cnn base.pt --model base", "base: expected a name that no other row of the table uses"),
     ],
 )
 def test_a_mistake_is_reported_in_one_line_before_anything_is_measured(folder, capfd, options, expected):

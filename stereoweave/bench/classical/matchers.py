@@ -25,7 +25,7 @@ def make_classical_matcher(name: str) -> MapMatch:
     """
     if name not in CLASSICAL_MATCHERS:
         known = ", ".join(CLASSICAL_MATCHERS)
-        raise StereoweaveError(f"expected {known}, found {name!r}", setting="matchers")
+        raise StereoweaveError(f"expected one of {known}, found {name!r}", setting="matchers")
     return CLASSICAL_MATCHERS[name]
 
 

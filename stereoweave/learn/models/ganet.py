@@ -252,7 +252,7 @@ class GANet(nn.Module):
         max_disparity_px: Largest candidate, rounded up to a multiple of 12.
     """
 
-    # Of crops and pairs in recipes, which need not be multiples of 48.
+    # Crops need no multiple, because images are padded to 48; 16 is that of the paper's crops.
     multiple_of = 16
     predicts: ClassVar[Literal["code", "disparity_px"]] = "disparity_px"
 

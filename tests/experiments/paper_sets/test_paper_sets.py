@@ -1,3 +1,4 @@
+import csv
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -61,11 +62,14 @@ def test_a_command_has_the_focal_length_of_its_size():
     assert one.spec((320, 240)).rig == (264.0, 0.25)
 
 
-def test_the_recipe_trains_on_a_set_at_half_the_paper_s_size():
+def test_the_recipe_s_largest_disparity_at_half_the_paper_s_size_covers_the_nearest_surface_of_its_set():
     recipe = read_recipe(ROOT / "recipes/paper/propeller_worlds.toml")
-    assert (recipe.dataset, recipe.root) == ("paper_worlds", "runs/worlds/propeller")
-    assert (recipe.split, recipe.leave_out) == ("random", "disjoint")
-    assert (recipe.target, recipe.max_depth_m, recipe.crop_size) == ("depth", 15.0, (128, 192))
+    with (ROOT / "results/paper_sets/sets.csv").open() as file:
+        nearest_m = {row["scene"]: float(row["nearest_m"]) for row in csv.DictReader(file)}
+    one = next(one for one in SETS if one.scene == Path(recipe.root).name)
+    focal_px, baseline_m = one.spec((320, 240)).rig
+    # 264 px * 0.25 m / 64 px is 1.03 m.
+    assert focal_px * baseline_m / recipe.max_disparity_px < nearest_m[one.scene]
 
 
 def test_pixels_of_a_wall_move_by_focal_length_times_shift_over_depth():
