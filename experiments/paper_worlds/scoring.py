@@ -12,10 +12,8 @@ from stereoweave.bench.projected_views import DisparityMethod, ProjectionRow, sc
 from stereoweave.data.frames import Frame
 from stereoweave.data.poses import Pose, find_nearest_frames, read_poses
 from stereoweave.errors import StereoweaveError
-from stereoweave.learn import checkpoint
-from stereoweave.learn.checkpoint import Checkpoint
-from stereoweave.learn.data.sources import DatasetFrames, divide_frames
-from stereoweave.learn.evaluation import MEDIAN, identify_held_out, make_median_method, make_method
+from stereoweave.learn.data.sources import DatasetFrames, divide_frames, spread_evenly
+from stereoweave.learn.evaluation import MEDIAN, identify_held_out, load_runs, make_median_method, make_method
 from stereoweave.learn.recipe import Recipe
 
 NEAREST = "nearest frame"
@@ -63,13 +61,11 @@ def score_worlds(recipe: Recipe, runs: Sequence[Path], most: int | None = None) 
         most: Greatest number of frames to score per split, evenly spread; None for all.
 
     Raises:
-        StereoweaveError: The recipe leaves out no split of a set by world; a run has other pairs; two runs
-            share a name; or the set is incomplete.
+        StereoweaveError: The recipe leaves out no split of a set by world; a run has other pairs; two rows
+            would have the same name; or the set is incomplete.
     """
     _check_recipe(recipe)
-    kept = {(run if run.is_dir() else run.with_suffix("")).name: _load(run) for run in runs}
-    if len(kept) < len(runs):
-        raise StereoweaveError("runs: expected different names, found a duplicate; rename a run")
+    kept = load_runs(runs, (MEDIAN, NEAREST))
     for name, one in kept.items():
         _check_pairs(name, one.recipe, recipe)
     training, *parts = divide_frames(recipe)
@@ -77,7 +73,7 @@ def score_worlds(recipe: Recipe, runs: Sequence[Path], most: int | None = None) 
     methods |= {name: make_method(one) for name, one in kept.items()}
     scorer = WorldScorer(recipe.max_depth_m, training, read_poses(Path(recipe.root)), methods)
     for split, frames in zip((recipe.split, recipe.leave_out), parts, strict=True):
-        for row in scorer.score(_spread(frames, most)):
+        for row in scorer.score(spread_evenly(frames, most)):
             found = kept.get(row["method"])
             yield WorldsRow(split=split, steps=found.step if found else 0, **row)
 
@@ -129,10 +125,6 @@ class WorldScorer:
         return np.where(np.isfinite(sample.disparity_px), sample.disparity_px, farthest_px)
 
 
-def _load(run: Path) -> Checkpoint:
-    return checkpoint.load(run / "last.pt" if run.is_dir() else run)
-
-
 def _check_recipe(recipe: Recipe) -> None:
     if recipe.dataset != WORLDS or not recipe.leave_out:
         raise StereoweaveError(
@@ -148,11 +140,6 @@ def _check_pairs(name: str, trained: Recipe, recipe: Recipe) -> None:
             f"{name}: expected a run with the held-out pairs of {recipe.name}, {identify_held_out(recipe)}, "
             f"found {identify_held_out(trained)}; score it with its own recipe"
         )
-
-
-def _spread(frames: Sequence[Frame], most: int | None) -> list[Frame]:
-    count = min(most or len(frames), len(frames))
-    return [frames[i] for i in np.linspace(0, len(frames) - 1, count).round().astype(int)]
 
 
 def _average(rows: Iterable[ProjectionRow]) -> dict[str, Any]:

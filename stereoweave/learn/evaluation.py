@@ -41,10 +41,7 @@ def evaluate(runs: Sequence[Path], folder: Path, console: Console) -> list[Proje
     Raises:
         StereoweaveError: If the runs have different held-out pairs, or two rows would have the same name.
     """
-    names = [run.name if run.is_dir() else run.stem for run in runs]
-    _check_names(names)
-    files = [run / "last.pt" if run.is_dir() else run for run in runs]
-    networks = {name: checkpoint.load(file) for name, file in zip(names, files, strict=True)}
+    networks = load_runs(runs)
     recipe = _find_common_recipe(networks)
     training, held_out = (cache_pairs(pairs, console) for pairs in open_sources(recipe, folder, whole=True))
     methods = {
@@ -53,6 +50,22 @@ def evaluate(runs: Sequence[Path], folder: Path, console: Console) -> list[Proje
     }
     samples = (read_known(held_out, index) for index in range(held_out.count))
     return score_projections(methods, samples, recipe.max_depth_m if recipe.target == "depth" else None)
+
+
+def load_runs(runs: Sequence[Path], taken: Sequence[str] = (MEDIAN,)) -> dict[str, Checkpoint]:
+    """Return the last checkpoint of each run, by the run's name.
+
+    Args:
+        runs: Run folders of `stereoweave train`, or checkpoints.
+        taken: Names of other rows, which no run may have.
+
+    Raises:
+        StereoweaveError: Two rows would have the same name.
+    """
+    names = [run.name if run.is_dir() else run.stem for run in runs]
+    _check_names(names, taken)
+    files = [run / "last.pt" if run.is_dir() else run for run in runs]
+    return {name: checkpoint.load(file) for name, file in zip(names, files, strict=True)}
 
 
 def make_method(trained: Checkpoint) -> DisparityMethod:
@@ -86,11 +99,12 @@ def make_median_method(training: PairSource) -> DisparityMethod:
     return lambda sample: np.full_like(sample.disparity_px, median_px)
 
 
-def _check_names(names: Sequence[str]) -> None:
-    rows = [MEDIAN, *names]
+def _check_names(names: Sequence[str], taken: Sequence[str]) -> None:
+    rows = [*taken, *names]
     if twice := [name for name in names if rows.count(name) > 1]:
+        others = " and ".join(map(repr, taken))
         raise StereoweaveError(
-            f"{twice[0]}: expected a unique name other than {MEDIAN!r}, found a duplicate; rename the run"
+            f"{twice[0]}: expected a unique name other than {others}, found a duplicate; rename the run"
         )
 
 

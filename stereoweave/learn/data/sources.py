@@ -1,5 +1,6 @@
 """Sources of a recipe's pairs: collages, rendered sets, or a dataset on disk."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple, Protocol, runtime_checkable
@@ -156,9 +157,14 @@ def open_sources(recipe: Recipe, folder: Path, whole: bool = False) -> tuple[Pai
             CachedPairs(folder, VALIDATION_SEED, recipe.validation_pairs, recipe.pair_size),
         )
     training, held_out, _ = divide_frames(recipe)
-    count = len(held_out) if whole else min(recipe.validation_pairs, len(held_out))
-    spread = np.linspace(0, len(held_out) - 1, count).round().astype(int)
-    return DatasetFrames(training), DatasetFrames([held_out[i] for i in spread])
+    spread = spread_evenly(held_out, None if whole else recipe.validation_pairs)
+    return DatasetFrames(training), DatasetFrames(spread)
+
+
+def spread_evenly(frames: Sequence[Frame], most: int | None) -> list[Frame]:
+    """Return at most that many of the frames, evenly spread from the first to the last; None for all."""
+    count = len(frames) if most is None else min(most, len(frames))
+    return [frames[i] for i in np.linspace(0, len(frames) - 1, count).round().astype(int)]
 
 
 class FrameParts(NamedTuple):

@@ -113,4 +113,11 @@ def test_a_run_of_other_pairs_and_equal_names_are_one_line_errors(recipe, run):
     assert "tiny: expected a run with the held-out pairs of tiny" in complaint(
         lambda: list(score_worlds(other, [run]))
     )
-    assert "runs: expected different names" in complaint(lambda: list(score_worlds(recipe, [run, run])))
+    told = complaint(lambda: list(score_worlds(recipe, [run, run])))
+    assert told.startswith("tiny: expected a unique name other than 'median' and 'nearest frame', found a")
+
+
+@pytest.mark.parametrize("name", ["median", "nearest frame"])
+def test_a_run_with_the_name_of_another_row_is_a_one_line_error(recipe, tmp_path, name):
+    told = complaint(lambda: list(score_worlds(recipe, [tmp_path / name])))
+    assert told.startswith(f"{name}: expected a unique name other than 'median' and 'nearest frame'")
