@@ -1,6 +1,5 @@
 """What the classical matchers share: matching costs, the right view's costs, and the left-right check."""
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -14,13 +13,11 @@ from stereoweave.stereo import StereoPair
 HOLE = np.float32(-1)
 """Disparity of a pixel that has none."""
 
-CostFunction = Callable[[StereoPair], UInt8[np.ndarray, "h w d"]]
-"""Returns the left view's matching costs [H, W, D]: candidate i is a disparity of i px, and low is good."""
-
 
 def match_census_and_colour(pair: StereoPair) -> UInt8[np.ndarray, "h w d"]:
-    """Return the costs that the networks' refinement uses, 0..108 [H, W, 192].
+    """Return the left view's matching costs, as the networks' refinement uses them, 0..108 [H, W, 192].
 
+    Candidate i is a disparity of i px, and low is good.
     A cost is half the difference in colour, which is insensitive to sampling (Birchfield and Tomasi 1998) and
     limited to 60, plus two for each of the 24 pixels around that the census compares otherwise.
     """

@@ -10,7 +10,7 @@ matched with a pixel of the right row, in order, or passed over at a fixed cost.
 import numpy as np
 from jaxtyping import Float32
 
-from stereoweave.bench.classical.costs import CostFunction, match_census_and_colour
+from stereoweave.bench.classical.costs import match_census_and_colour
 from stereoweave.bench.classical.windows import find_window_costs
 from stereoweave.stereo import StereoPair
 
@@ -18,14 +18,12 @@ OCCLUSION_COST = 20.0
 """Cost of a pixel without a match, in the unit of the matching costs."""
 
 
-def match_scanlines(
-    pair: StereoPair, find_costs: CostFunction = match_census_and_colour
-) -> Float32[np.ndarray, "h w"]:
+def match_scanlines(pair: StereoPair) -> Float32[np.ndarray, "h w"]:
     """Return the left disparity in px [H, W] of each row's cheapest alignment; -1 in occluded pixels."""
     from stereoweave.bench.classical.scanline_kernels import align_rows  # it loads LLVM
     from stereoweave.bench.classical.window_kernels import STEPS
 
-    costs = find_window_costs(find_costs(pair))
+    costs = find_window_costs(match_census_and_colour(pair))
     found_px = np.empty(costs.shape[:2], np.float32)
     align_rows(costs, round(STEPS * OCCLUSION_COST), found_px)
     return found_px

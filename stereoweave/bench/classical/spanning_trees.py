@@ -14,18 +14,13 @@ Rother ("PatchMatch stereo", 2011) for proposals and the left-right check. Known
 - Some proposals are planes through the disparities of three of the tree's pixels.
 - Pixels that fail the left-right check stay holes, which `bench pairs` fills as for all matchers. PatchMatch
   stereo extends planes and takes a weighted median.
-- Matching costs are census and colour. The paper's are those of MC-CNN; `find_costs` takes any others.
+- Matching costs are census and colour. The paper's are those of MC-CNN.
 """
 
 import numpy as np
 from jaxtyping import Float32, Int64, UInt8
 
-from stereoweave.bench.classical.costs import (
-    CostFunction,
-    keep_agreed,
-    match_census_and_colour,
-    see_from_right,
-)
+from stereoweave.bench.classical.costs import keep_agreed, match_census_and_colour, see_from_right
 from stereoweave.bench.classical.trees import Forest, grow_forest
 from stereoweave.stereo import StereoPair
 
@@ -34,18 +29,10 @@ CHANGED = 7
 """Number of changed labels that a sweep proposes to each tree."""
 
 
-def match_spanning_trees(
-    pair: StereoPair, find_costs: CostFunction = match_census_and_colour, seed: int = 0
-) -> Float32[np.ndarray, "h w"]:
-    """Return the left disparity in px [H, W] by 3DMST; -1 where the right view disagrees.
-
-    Args:
-        pair: The pair to match.
-        find_costs: Matching costs of the left view, at most 119.
-        seed: Random seed.
-    """
-    costs = find_costs(pair)
-    draw = np.random.default_rng(seed)
+def match_spanning_trees(pair: StereoPair) -> Float32[np.ndarray, "h w"]:
+    """Return the left disparity in px [H, W] by 3DMST; -1 where the right view disagrees."""
+    costs = match_census_and_colour(pair)
+    draw = np.random.default_rng(0)
     planes = find_planes(pair.left, costs, draw)
     right_planes = find_planes(pair.right, see_from_right(costs), draw)
     most_px = costs.shape[2] - 1
@@ -59,7 +46,7 @@ def find_planes(
 
     Args:
         image: The view, uint8 RGB [H, W, 3].
-        costs: Its matching costs [H, W, D].
+        costs: Its matching costs [H, W, D], at most 119.
         draw: Source of the random proposals.
     """
     from stereoweave.bench.classical import label_kernels as kernels  # it loads LLVM

@@ -15,12 +15,7 @@ The window of least cost decides. Veksler searches rectangles; here are squares 
 import numpy as np
 from jaxtyping import Float32, UInt8, UInt16
 
-from stereoweave.bench.classical.costs import (
-    CostFunction,
-    keep_agreed,
-    match_census_and_colour,
-    see_from_right,
-)
+from stereoweave.bench.classical.costs import keep_agreed, match_census_and_colour, see_from_right
 from stereoweave.stereo import StereoPair
 
 RADII_PX = (2, 4, 7, 12)
@@ -41,11 +36,9 @@ def find_window_costs(costs: UInt8[np.ndarray, "h w d"]) -> UInt16[np.ndarray, "
     return least
 
 
-def match_windows(
-    pair: StereoPair, find_costs: CostFunction = match_census_and_colour
-) -> Float32[np.ndarray, "h w"]:
+def match_windows(pair: StereoPair) -> Float32[np.ndarray, "h w"]:
     """Return the left disparity in px [H, W] of the best windows; -1 where the right view disagrees."""
-    costs = find_window_costs(find_costs(pair))
+    costs = find_window_costs(match_census_and_colour(pair))
     return keep_agreed(_pick(costs), _pick(see_from_right(costs)))
 
 
