@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from experiments.command_line import RecipeFile, RunsFolder, Seeds, run
-from experiments.paper.trials import ADJUSTMENT, CLAIMS
+from experiments.paper.trials import CLAIMS, Extent
 from stereoweave.cli.options import require_train_extra
 
 
@@ -18,9 +18,21 @@ def paper(  # noqa: PLR0913 - each is an option of the command line
     report: Annotated[Path, typer.Option(help="Folder to write rows, tables and figures to.")],
     seeds: Seeds = 3,
     jobs: Annotated[int, typer.Option(min=1, help="Number of trainings that run in parallel.")] = 1,
-    exponent_only: Annotated[
-        bool, typer.Option("--exponent-only", help="Run only the depth adjustment (Fig. 2).")
-    ] = False,
+    slow_steps: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="Steps of PSMNet, SCV-Net and GA-Net, and of the networks compared with them. Default: a "
+            "quarter of the recipe's.",
+        ),
+    ] = None,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="CLAIM",
+            help=f"Train only for this claim; repeat for more. One of {', '.join(CLAIMS)}.",
+        ),
+    ] = None,
 ) -> None:
     """Train the paper's network, its rivals and all variants, and compare them with the paper's tables.
 
@@ -34,7 +46,7 @@ def paper(  # noqa: PLR0913 - each is an option of the command line
         from experiments.paper.report import write_report
         from stereoweave.learn.recipe import read_recipe
     base = read_recipe(recipe)
-    planned = plan(base, out, seeds, console, (ADJUSTMENT,) if exponent_only else CLAIMS)
+    planned = plan(base, out, Extent(seeds=seeds, slow_steps=slow_steps, claims=only or CLAIMS), console)
     run_trials(planned, out, jobs, console)
     write_report(base, planned, out, report)
     typer.echo(f"tables: {report / 'paper.md'}")

@@ -1,8 +1,7 @@
 """The paper's experiment: runs every training of trials.py on the same pairs in the same order."""
 
 import multiprocessing
-import os
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +9,7 @@ from pathlib import Path
 import torch
 from rich.console import Console
 
-from experiments.paper.trials import CLAIMS, SHORT, list_trials
+from experiments.paper.trials import CLAIMS, SLOW_SHARE, Extent, list_trials
 from experiments.trial import Trial
 from stereoweave.errors import StereoweaveError
 from stereoweave.learn.data.sources import cache_pairs, open_sources
@@ -19,27 +18,23 @@ from stereoweave.learn.training.loop import train_recipe
 from stereoweave.learn.training.objective import fit_recipe
 
 
-def plan(
-    base: Recipe, runs: Path, seeds: int, console: Console, claims: Collection[str] = CLAIMS
-) -> list[Trial]:
-    """Plan the trials of some claims, create their missing pairs, and fit the exponent.
+def plan(base: Recipe, runs: Path, extent: Extent, console: Console) -> list[Trial]:
+    """Plan the trials, create their missing pairs, and fit the exponent.
 
     Args:
         base: The paper's recipe for the data at hand; the exponent is fitted to its training pairs.
         runs: Folder of the runs, with cached pairs in the subfolder `pairs`.
-        seeds: Number of times that each setting is trained, with different seeds.
+        extent: Which claims are tested, and how often.
         console: Console that shows the progress.
-        claims: Names in CLAIMS.
 
     Raises:
-        StereoweaveError: If the base has another network or too few steps, or if its target is depth and its
-            pairs have no camera.
+        StereoweaveError: If a claim is unknown, if the base has another network, too few steps or fewer than
+            the slow networks, or if its target is depth and its pairs have no camera.
     """
-    _check_base(base)
+    _check_base(base, extent)
     training, _ = (cache_pairs(pairs, console) for pairs in open_sources(base, runs / "pairs"))
     exponent = fit_recipe(replace(base, fit_exponent=True), training).exponent
-    chosen = (trial for trial in list_trials(base, seeds, exponent) if trial.claim in claims)
-    planned = [_resolve_start(trial, runs) for trial in chosen]
+    planned = [_resolve_start(trial, runs) for trial in list_trials(base, extent, exponent)]
     for trial in planned:
         for pairs in open_sources(trial.recipe, runs / "pairs"):
             cache_pairs(pairs, console)
@@ -61,7 +56,7 @@ def run_trials(planned: Iterable[Trial], runs: Path, jobs: int, console: Console
     _train_all([recipe for recipe in recipes if recipe.start_from], runs, jobs, console)
 
 
-def _check_base(base: Recipe) -> None:
+def _check_base(base: Recipe, extent: Extent) -> None:
     # Collages have no camera, which depth as a target would need.
     target = {"target": "disparity"} if base.dataset == COLLAGE else {}
     for key, expected in {"model": "fast_depth", **target}.items():
@@ -70,10 +65,13 @@ def _check_base(base: Recipe) -> None:
                 f"{base.name}: {key}: expected {expected!r}, from which the experiment starts, "
                 f"found {found!r}"
             )
-    if base.steps < SHORT:
+    if unknown := [claim for claim in extent.claims if claim not in CLAIMS]:
+        raise StereoweaveError(f"only: expected some of {', '.join(CLAIMS)}, found {unknown[0]!r}")
+    least = extent.slow_steps or SLOW_SHARE
+    if base.steps < least:
         raise StereoweaveError(
-            f"{base.name}: steps: expected at least {SHORT}, because some trainings take a quarter of them, "
-            f"found {base.steps}"
+            f"{base.name}: steps: expected at least {least}, because the slow networks train for fewer steps "
+            f"than the others, found {base.steps}"
         )
 
 
@@ -97,5 +95,5 @@ def _train_all(recipes: Iterable[Recipe], runs: Path, jobs: int, console: Consol
 
 
 def _train(recipe: Recipe, folder: Path, jobs: int) -> None:
-    torch.set_num_threads(max(1, (os.cpu_count() or 1) // jobs))
+    torch.set_num_threads(max(1, torch.get_num_threads() // jobs))
     train_recipe(recipe, folder, Console(quiet=True))

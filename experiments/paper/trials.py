@@ -1,7 +1,7 @@
 """Training runs of the paper's experiment: for each claim, recipes that differ in one respect only."""
 
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, replace
 from typing import Any
 
 from experiments.trial import Trial
@@ -9,7 +9,7 @@ from stereoweave.learn.recipe import COLLAGE, Recipe
 
 CLAIMS = NETWORKS, NETWORKS_SHORT, ADJUSTMENT, PROJECTION, LOSS, DECODER, TRANSFER, ITERATIONS = (
     "networks",
-    "networks, a quarter of the steps",
+    "networks, fewer steps",
     "depth adjustment",
     "projection loss",
     "loss",
@@ -29,8 +29,8 @@ RIVAL_SETTINGS: dict[str, dict[str, Any]] = {
     "ganet_11": {"exponent": 1.0, "alpha_p": 0.0, "loss": "smooth_l1"},
 }
 # PSMNet takes 59 times the multiply-adds of the paper's network, and SCV-Net and GA-Net are as slow, so they
-# are compared with it after fewer steps.
-SHORT = 4
+# are compared with it after fewer steps: a quarter, unless the extent has another number.
+SLOW_SHARE = 4
 FIGURE_3_STEPS = (10, 50, 250)
 # The target set of the transfer: fewer and larger collages with larger disparities.
 OTHER_SEED = 100
@@ -38,30 +38,46 @@ OTHER_PAIRS = 500
 OTHER_SIZE = 1.5
 
 
-def list_trials(base: Recipe, seeds: int, fitted_exponent: float) -> list[Trial]:
-    """List all training runs of the experiment, the most important first.
+@dataclass(frozen=True, kw_only=True)
+class Extent:
+    """How much of the experiment is run.
+
+    Attributes:
+        seeds: Number of times that each setting is trained, except for the networks after fewer steps,
+            DispNet, the transfer and the iterations, which are trained once.
+        slow_steps: Number of steps of the slow networks, and of those compared with them; None for a quarter
+            of the base's.
+        claims: Names in CLAIMS.
+    """
+
+    seeds: int = 3
+    slow_steps: int | None = None
+    claims: Collection[str] = CLAIMS
+
+
+def list_trials(base: Recipe, extent: Extent, fitted_exponent: float) -> list[Trial]:
+    """List the training runs of the experiment, the most important first.
 
     A run that serves several claims is listed once for each, with the same recipe name. The transfer to
     another set needs collages, because a recipe names only one dataset on disk.
 
     Args:
         base: The paper's recipe for the data at hand.
-        seeds: Number of times that each setting is trained, except for the networks after a quarter of the
-            steps, DispNet, the transfer and the iterations, which are trained once.
+        extent: Which claims are tested, and how often.
         fitted_exponent: The exponent p fitted to the histogram of the ground truth that the base trains on.
     """
     # Otherwise every training would replace its exponent p by the fitted one.
-    base = replace(base, fit_exponent=False)
+    base, seeds = replace(base, fit_exponent=False), extent.seeds
     rivals = {rival: _rival_changes(rival) for rival in RIVAL_SETTINGS}
     every = {"psmnet": rivals["psmnet"], "fast_depth": {}, **rivals}
-    return [
+    trials = [
         *_repeat(seeds, base, PROJECTION, {PAPER: {}, "without": {"alpha_p": 0.0}}),
         *_repeat(seeds, base, NETWORKS, {"fast_depth": {}, "densemapnet": rivals["densemapnet"]}),
         *_repeat(seeds, base, ADJUSTMENT, {f"p = {p:g}": {"exponent": p} for p in (1.0, 1.5, 2.0, 1.25)}),
         *_repeat(
             seeds, base, ADJUSTMENT, {f"p = {fitted_exponent:.3g} {FITTED}": {"exponent": fitted_exponent}}
         ),
-        *_repeat(1, replace(base, steps=base.steps // SHORT), NETWORKS_SHORT, every),
+        *_repeat(1, _shorten(base, extent.slow_steps or base.steps // SLOW_SHARE), NETWORKS_SHORT, every),
         *_repeat(seeds, base, DECODER, {PAPER: {}, "upsampled at once, no skips": {"model": "densemapnet"}}),
         *_repeat(seeds, base, DECODER, {"step-wise, no skips": {"model": "fast_depth_without_skips"}}),
         *_repeat(seeds, base, LOSS, {"l2": {}, **{loss: {"loss": loss} for loss in _other_losses(base)}}),
@@ -69,6 +85,12 @@ def list_trials(base: Recipe, seeds: int, fitted_exponent: float) -> list[Trial]
         *_repeat(1, base, ITERATIONS, {f"{steps} steps": {"steps": steps} for steps in FIGURE_3_STEPS}),
         *_repeat(1, base, NETWORKS, {"dispnet": rivals["dispnet"]}),
     ]
+    return [trial for trial in trials if trial.claim in extent.claims]
+
+
+def _shorten(base: Recipe, steps: int) -> Recipe:
+    """Return the recipe with fewer steps, of which the learning rate falls over the same share."""
+    return replace(base, steps=steps, cool_down_steps=base.cool_down_steps * steps // base.steps)
 
 
 def _repeat(seeds: int, base: Recipe, claim: str, settings: dict[str, dict[str, Any]]) -> Iterator[Trial]:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.paper.trials import CLAIMS
+from experiments.paper.trials import Extent
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 RECIPE = REPOSITORY / "recipes" / "weave_small.toml"
@@ -61,8 +61,9 @@ def folder(tmp_path, monkeypatch):
         (f"paper {RECIPE} -o runs --report report", ["small", "expected 'fast_depth'"]),
         (f"paper {RECIPE} -o runs", ["--report", "--help"]),
         (f"paper {RECIPE} -o runs --report report --seeds 0", ["--seeds"]),
-        ("paper words.toml -o runs --report report --exponent-only", ["words.toml", "expected a recipe"]),
-        (f"paper {RECIPE} -o runs --report report --exponent-only --jobs 0", ["--jobs"]),
+        (f"paper {RECIPE} -o runs --report report --jobs 0", ["--jobs"]),
+        (f"paper {RECIPE} -o runs --report report --slow-steps 0", ["--slow-steps"]),
+        (f"paper {PAPER_RECIPE} -o runs --report report --only speed", ["only: expected", "'speed'"]),
         ("ablations none.toml -o runs --report rows.csv", ["none.toml", "expected a recipe"]),
         ("stage_costs none.pt -o rows.csv", ["none.pt", "no such checkpoint"]),
         ("paper_worlds none.toml -o rows.csv", ["none.toml", "expected a recipe"]),
@@ -162,17 +163,23 @@ def test_scores_by_world_are_written_and_printed_by_split(folder, monkeypatch, c
 
 
 @pytest.mark.parametrize(
-    ("option", "claims"),
-    [("", CLAIMS), ("--exponent-only", ("depth adjustment",))],
-    ids=["all claims", "exponent only"],
+    ("options", "extent"),
+    [
+        ("", Extent(seeds=2)),
+        (
+            "--slow-steps 7 --only loss --only decoder",
+            Extent(seeds=2, slow_steps=7, claims=["loss", "decoder"]),
+        ),
+    ],
+    ids=["all claims", "two claims"],
 )
-def test_the_papers_experiment_is_planned_trained_and_reported(folder, monkeypatch, capfd, option, claims):
+def test_the_papers_experiment_is_planned_trained_and_reported(folder, monkeypatch, capfd, options, extent):
     from experiments.paper import experiment, report
 
     done = []
 
-    def plan(base, runs, seeds, console, chosen):
-        done.append(("plan", base.name, runs, seeds, chosen))
+    def plan(base, runs, asked, console):
+        done.append(("plan", base.name, runs, asked))
         return ["trials"]
 
     monkeypatch.setattr(experiment, "plan", plan)
@@ -180,10 +187,10 @@ def test_the_papers_experiment_is_planned_trained_and_reported(folder, monkeypat
     monkeypatch.setattr(
         report, "write_report", lambda base, *given: done.append(("report", base.name, *given))
     )
-    assert run(f"paper {PAPER_RECIPE} -o runs --report results --seeds 2 --jobs 4 {option}") == 0
+    assert run(f"paper {PAPER_RECIPE} -o runs --report results --seeds 2 --jobs 4 {options}") == 0
     runs, results = Path("runs"), Path("results")
     assert done == [
-        ("plan", "experiment", runs, 2, claims),
+        ("plan", "experiment", runs, extent),
         ("train", ["trials"], runs, 4),
         ("report", "experiment", ["trials"], runs, results),
     ]

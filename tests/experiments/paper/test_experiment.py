@@ -31,6 +31,7 @@ from experiments.paper.trials import (
     PAPER,
     PROJECTION,
     TRANSFER,
+    Extent,
     list_trials,
 )
 from experiments.trial import Trial
@@ -120,7 +121,7 @@ def experiment(tmp_path_factory):
         training.keep(index, box_before_a_wall(rng, SIZE, wall_px=12, box_px=14))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(the_trials, "FIGURE_3_STEPS", (1, 2))
-        planned = plan(BASE, runs, 1, QUIET, CLAIMS)
+        planned = plan(BASE, runs, Extent(seeds=1, claims=CLAIMS), QUIET)
         experiment = Experiment(planned, runs, out)
         run_trials(experiment.of(FIRST), runs, JOBS, QUIET)
         train_in_place(patch)
@@ -163,12 +164,31 @@ def test_the_exponent_is_fitted_to_the_training_truth(experiment):
             {"target": "depth"},
             "target: expected 'disparity', from which the experiment starts, found 'depth'",
         ),
-        ({"steps": 3}, "steps: expected at least 4, because some trainings take a quarter of them, found 3"),
+        (
+            {"steps": 3},
+            "steps: expected at least 4, because the slow networks train for fewer steps than the others, "
+            "found 3",
+        ),
     ],
 )
 def test_a_plan_starts_from_the_papers_network_and_of_collages_from_disparity(tmp_path, changes, words):
-    assert complaint(plan, replace(BASE, **changes), tmp_path, 1, QUIET) == f"base: {words}"
+    assert complaint(plan, replace(BASE, **changes), tmp_path, Extent(seeds=1), QUIET) == f"base: {words}"
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("extent", "words"),
+    [
+        (
+            Extent(slow_steps=5),
+            "base: steps: expected at least 5, because the slow networks train for fewer steps than the "
+            "others, found 4",
+        ),
+        (Extent(claims=["speed"]), f"only: expected some of {', '.join(the_trials.CLAIMS)}, found 'speed'"),
+    ],
+)
+def test_a_plan_refuses_claims_and_steps_that_it_cannot_have(tmp_path, extent, words):
+    assert complaint(plan, BASE, tmp_path, extent, QUIET) == words
 
 
 def test_every_trial_that_was_asked_for_is_trained_to_its_end(experiment):
@@ -271,7 +291,7 @@ def test_what_starts_from_another_training_comes_after_it(monkeypatch, tmp_path)
     monkeypatch.setattr(
         paper, "_train_all", lambda recipes, *_: rounds.append([recipe.name for recipe in recipes])
     )
-    run_trials(list_trials(BASE, 1, 1.37)[::-1], tmp_path, 1, QUIET)
+    run_trials(list_trials(BASE, Extent(seeds=1), 1.37)[::-1], tmp_path, 1, QUIET)
     first, second = rounds
     assert second == ["fast_depth-l2-p1.5-projection1-steps4-seed100-tuned"]
     assert FIRST in first
@@ -279,7 +299,7 @@ def test_what_starts_from_another_training_comes_after_it(monkeypatch, tmp_path)
 
 
 def test_a_tuned_trial_starts_from_a_run_below_the_folder_of_the_runs():
-    tuned = next(trial for trial in list_trials(BASE, 1, 1.37) if trial.recipe.start_from)
+    tuned = next(trial for trial in list_trials(BASE, Extent(seeds=1), 1.37) if trial.recipe.start_from)
     for spelled in (Path("runs"), Path("runs/../runs")):
         start_from = paper._resolve_start(tuned, spelled).recipe.start_from
         assert start_from == str(Path.cwd() / "runs" / FIRST / "last.pt")
@@ -302,7 +322,7 @@ def report_of(trained, curves):
 
 def transfer_of(scratch, tuned):
     """Return what the report says of two trainings with these (step, loss) curves."""
-    trained = [trial for trial in list_trials(BASE, 1, 1.37) if trial.claim == TRANSFER]
+    trained = [trial for trial in list_trials(BASE, Extent(seeds=1), 1.37) if trial.claim == TRANSFER]
     curves = [[{"step": step, "loss": loss} for step, loss in curve] for curve in (scratch, tuned)]
     named = {trial.recipe.name: curve for trial, curve in zip(trained, curves, strict=True)}
     report = report_of(trained, named)
@@ -324,12 +344,12 @@ def test_transfer_counts_the_steps_to_the_best_loss_from_scratch():
 
 
 def test_a_fitted_exponent_that_was_planned_anyway_is_named_and_drawn_once():
-    planned = [trial for trial in list_trials(BASE, 2, 1.5) if trial.claim == ADJUSTMENT]
+    planned = [trial for trial in list_trials(BASE, Extent(seeds=2), 1.5) if trial.claim == ADJUSTMENT]
     assert paper_report._describe_fit(planned) == (
         "The exponent fitted to the histogram of the training pairs' ground truth is 1.5, the same as "
         "p = 1.5: both rows show the same trainings."
     )
-    assert paper_report._describe_fit(list_trials(BASE, 1, 1.3742)) == (
+    assert paper_report._describe_fit(list_trials(BASE, Extent(seeds=1), 1.3742)) == (
         "The exponent fitted to the histogram of the training pairs' ground truth is 1.374."
     )
     curves = {trial.recipe.name: [{"step": 2.0, "squared_error": 0.5}] for trial in planned}
@@ -358,7 +378,7 @@ def on_disk(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         train_in_place(patch)
         patch.setattr(the_trials, "FIGURE_3_STEPS", (1, 2))
-        planned = plan(base, runs, 1, QUIET)
+        planned = plan(base, runs, Extent(seeds=1), QUIET)
         experiment = Experiment(planned, runs, out)
         run_trials(experiment.of(*ON_DISK), runs, JOBS, QUIET)
     write_report(base, planned, runs, out)
@@ -419,7 +439,7 @@ def test_run_times_beside_the_report_join_it(experiment, tmp_path):
 
 def test_a_report_of_nothing_is_refused(tmp_path):
     out = tmp_path / "report"
-    planned = list_trials(BASE, 1, 1.37)
+    planned = list_trials(BASE, Extent(seeds=1), 1.37)
     names = {trial.recipe.name for trial in planned}
     assert complaint(write_report, BASE, planned, tmp_path / "runs", out) == (
         f"{tmp_path}/runs: expected at least one finished trial, found none of {len(names)}; "

@@ -17,10 +17,20 @@ from experiments.paper.trials import (
     SCRATCH,
     TRANSFER,
     TUNED,
+    Extent,
     list_trials,
 )
 
-BASE = recipe_of("fast_depth", steps=600, exponent=1.5, alpha_p=1.0, seed=5, max_disparity_px=32.0)
+BASE = recipe_of(
+    "fast_depth",
+    steps=600,
+    cool_down_steps=0,
+    exponent=1.5,
+    alpha_p=1.0,
+    seed=5,
+    max_disparity_px=32.0,
+)
+ONCE, TWICE, THRICE = (Extent(seeds=seeds) for seeds in (1, 2, 3))
 PLAIN = {"exponent": 1.0, "alpha_p": 0.0}
 DENSEMAPNET = {"model": "densemapnet", **PLAIN}
 DISPNET = {"model": "dispnet", **PLAIN, "loss": "l1", "learning_rate": 1e-4}
@@ -74,13 +84,15 @@ def difference(recipe):
 
 
 def test_a_trial_differs_from_the_base_only_in_its_setting():
-    found = {(trial.claim, trial.setting): difference(trial.recipe) for trial in list_trials(BASE, 1, 1.37)}
+    found = {
+        (trial.claim, trial.setting): difference(trial.recipe) for trial in list_trials(BASE, ONCE, 1.37)
+    }
     assert found == DIFFERENCES
     assert {claim for claim, _ in found} == set(CLAIMS)
 
 
 def test_what_is_compared_with_an_interval_is_trained_with_every_seed():
-    planned = list_trials(BASE, 3, 1.37)
+    planned = list_trials(BASE, THRICE, 1.37)
     counts = Counter((trial.claim, trial.setting) for trial in planned)
     assert counts == {key: 3 if key in SEVERAL else 1 for key in DIFFERENCES}
     for key in SEVERAL:
@@ -91,23 +103,30 @@ def test_what_is_compared_with_an_interval_is_trained_with_every_seed():
 
 @pytest.mark.parametrize("fitted", [1.0, 1.37, 1.5])
 def test_a_name_stands_for_one_recipe_and_a_recipe_has_one_name(fitted):
-    recipes = {trial.recipe for trial in list_trials(BASE, 3, fitted)}
+    recipes = {trial.recipe for trial in list_trials(BASE, THRICE, fitted)}
     assert len({recipe.name for recipe in recipes}) == len(recipes)
     assert len({replace(recipe, name="") for recipe in recipes}) == len(recipes)
 
 
+def test_slow_networks_and_those_beside_them_take_the_steps_that_are_asked_for():
+    base = replace(BASE, cool_down_steps=200)
+    planned = list_trials(base, Extent(seeds=1, slow_steps=300, claims=[NETWORKS, NETWORKS_SHORT]), 1.37)
+    lengths = {(trial.claim, trial.recipe.steps, trial.recipe.cool_down_steps) for trial in planned}
+    assert lengths == {(NETWORKS, 600, 200), (NETWORKS_SHORT, 300, 100)}
+
+
 def test_the_papers_recipe_is_trained_once_for_five_claims():
-    claims = [trial.claim for trial in list_trials(BASE, 1, 1.37) if trial.recipe.name == FIRST]
+    claims = [trial.claim for trial in list_trials(BASE, ONCE, 1.37) if trial.recipe.name == FIRST]
     assert claims == [PROJECTION, NETWORKS, ADJUSTMENT, DECODER, LOSS]
 
 
 def test_a_base_that_fits_its_exponent_does_not_make_the_others_fit():
-    assert list_trials(replace(BASE, fit_exponent=True), 1, 1.37) == list_trials(BASE, 1, 1.37)
+    assert list_trials(replace(BASE, fit_exponent=True), ONCE, 1.37) == list_trials(BASE, ONCE, 1.37)
 
 
 def test_pairs_on_disk_have_all_trials_but_the_transfer():
-    on_disk = list_trials(replace(BASE, dataset="paper", root="propeller", target="depth"), 2, 1.37)
-    collages = list_trials(BASE, 2, 1.37)
+    on_disk = list_trials(replace(BASE, dataset="paper", root="propeller", target="depth"), TWICE, 1.37)
+    collages = list_trials(BASE, TWICE, 1.37)
     assert [trial.recipe.name for trial in on_disk] == [
         trial.recipe.name for trial in collages if trial.claim != TRANSFER
     ]
@@ -115,6 +134,6 @@ def test_pairs_on_disk_have_all_trials_but_the_transfer():
 
 
 def test_the_perceptual_loss_waits_for_its_file():
-    with_file = list_trials(replace(BASE, vgg16_weights="vgg16.npz"), 1, 1.37)
+    with_file = list_trials(replace(BASE, vgg16_weights="vgg16.npz"), ONCE, 1.37)
     losses = [trial.recipe.loss for trial in with_file if trial.claim == LOSS]
     assert losses == ["l2", "l1", "smooth_l1", "cross_entropy", "perceptual"]
