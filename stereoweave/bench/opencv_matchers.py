@@ -12,6 +12,8 @@ from stereoweave.stereo import StereoPair
 MapMatch = Callable[[StereoPair], Float32[np.ndarray, "h w"]]
 """Returns the left disparity of a pair, in px [H, W]; values <= 0 are holes."""
 
+LEAST_PX = np.float32(1e-3)
+"""Smallest disparity of a matcher that compares candidates from 0 px on, because 0 means a hole."""
 SGBM = "sgbm"
 DISPARITIES = 192
 

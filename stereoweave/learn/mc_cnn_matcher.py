@@ -15,7 +15,7 @@ from stereoweave.bench.mc_cnn.steps import (
     find_disparity,
     find_nearest_vectors,
 )
-from stereoweave.bench.opencv_matchers import DISPARITIES, MapMatch
+from stereoweave.bench.opencv_matchers import DISPARITIES, LEAST_PX, MapMatch
 from stereoweave.errors import StereoweaveError
 from stereoweave.learn.models.mc_cnn import MCCNN, load_weights, standardise
 from stereoweave.stereo import Sample, StereoPair
@@ -29,8 +29,6 @@ STEPS: dict[str, Steps] = {
     " aggregated": partial(find_disparity, settings=AGGREGATED),
 }
 """What follows the network, by the end of the matcher's name."""
-# Disparities are at least this, because a matcher's 0 means a hole and MC-CNN leaves none.
-_LEAST_PX = 1e-3
 
 
 def list_mc_cnns(files: Sequence[Path], threads: int | None) -> dict[str, Callable[[], MapMatch]]:
@@ -63,7 +61,7 @@ def make_mc_cnn(weights: str, steps: str, threads: int | None = None) -> MapMatc
 
     def match(pair: StereoPair) -> Float32[np.ndarray, "h w"]:
         left, right = (describe(network, view) for view in (pair.left, pair.right))
-        return find(left, right, DISPARITIES).clip(min=_LEAST_PX)
+        return find(left, right, DISPARITIES).clip(min=LEAST_PX)
 
     return match
 

@@ -10,7 +10,7 @@ matched with a pixel of the right row, in order, or passed over at a fixed cost.
 import numpy as np
 from jaxtyping import Float32
 
-from stereoweave.bench.classical.costs import match_census_and_colour
+from stereoweave.bench.classical.costs import mark_holes, match_census_and_colour
 from stereoweave.bench.classical.windows import find_window_costs
 from stereoweave.stereo import StereoPair
 
@@ -26,4 +26,4 @@ def match_scanlines(pair: StereoPair) -> Float32[np.ndarray, "h w"]:
     costs = find_window_costs(match_census_and_colour(pair))
     found_px = np.empty(costs.shape[:2], np.float32)
     align_rows(costs, round(STEPS * OCCLUSION_COST), found_px)
-    return found_px
+    return mark_holes(found_px, found_px >= 0)

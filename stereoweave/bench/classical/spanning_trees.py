@@ -31,10 +31,12 @@ CHANGED = 7
 
 def match_spanning_trees(pair: StereoPair) -> Float32[np.ndarray, "h w"]:
     """Return the left disparity in px [H, W] by 3DMST; -1 where the right view disagrees."""
+    from stereoweave.bench.classical.label_kernels import OUTSIDE  # it loads LLVM
+
     costs = match_census_and_colour(pair)
     draw = np.random.default_rng(0)
     planes = find_planes(pair.left, costs, draw)
-    right_planes = find_planes(pair.right, see_from_right(costs), draw)
+    right_planes = find_planes(pair.right, see_from_right(costs, int(OUTSIDE)), draw)
     most_px = costs.shape[2] - 1
     return keep_agreed(_at_pixels(planes, most_px), _at_pixels(right_planes, most_px))
 

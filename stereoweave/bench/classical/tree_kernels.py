@@ -26,8 +26,8 @@ def grow_trees(ends, weights, spread, least_pixels, most_pixels, pixels, chosen)
     """Mark the edges of the trees.
 
     The first round joins two trees (Felzenszwalb and Huttenlocher 2004) if the edge between them weighs no
-    more than the heaviest edge within either of them, plus spread / its pixels, and both have most_pixels at
-    most. The second round joins trees of fewer than least_pixels to a neighbour.
+    more than the heaviest edge within either of them, plus spread / its pixels, and if together they have
+    most_pixels at most. The second round joins trees of fewer than least_pixels to a neighbour.
 
     Args:
         ends: int32 [E, 2], the pixels of each edge; edges are in ascending order of weight.

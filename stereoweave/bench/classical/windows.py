@@ -39,7 +39,8 @@ def find_window_costs(costs: UInt8[np.ndarray, "h w d"]) -> UInt16[np.ndarray, "
 def match_windows(pair: StereoPair) -> Float32[np.ndarray, "h w"]:
     """Return the left disparity in px [H, W] of the best windows; -1 where the right view disagrees."""
     costs = find_window_costs(match_census_and_colour(pair))
-    return keep_agreed(_pick(costs), _pick(see_from_right(costs)))
+    outside = np.iinfo(costs.dtype).max
+    return keep_agreed(_pick(costs), _pick(see_from_right(costs, outside)))
 
 
 def _pick(costs: UInt16[np.ndarray, "h w d"]) -> Float32[np.ndarray, "h w"]:

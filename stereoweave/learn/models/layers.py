@@ -142,7 +142,7 @@ def cost_volume(
     """Concatenate the features of column x of `left` and column x - stride * d of `right`, d < levels.
 
     Right features are 0 if their column is outside the map. The plain reference is `cost_volume_plain` in
-    tests/learn/models/test_psmnet.py.
+    tests/learn/models/test_layers.py.
     """
     farthest, width = stride * (levels - 1), right.shape[3]
     padded = F.pad(right, (farthest, 0))

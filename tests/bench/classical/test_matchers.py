@@ -28,6 +28,14 @@ def test_each_finds_the_disparity_of_random_dots(dots, name):
 
 
 @pytest.mark.parametrize("name", CLASSICAL_MATCHERS)
+def test_a_surface_at_0_px_is_found_and_no_hole(dots, name):
+    disparity_px = make_classical_matcher(name)(StereoPair(left=dots.left, right=dots.left))
+    known_px = disparity_px[4:-4, 4:-4]
+    assert (known_px > 0).mean() > 0.99
+    assert np.median(known_px) == pytest.approx(0, abs=0.01)
+
+
+@pytest.mark.parametrize("name", CLASSICAL_MATCHERS)
 @pytest.mark.parametrize("size", [(1, 9), (9, 1), (1, 1)])
 def test_each_matches_a_pair_of_one_row_or_column(name, size):
     image = np.full((*size, 3), 90, np.uint8)

@@ -56,7 +56,7 @@ def test_the_fast_search_equals_the_plain_one(forest, costs, rng):
 
 def test_the_right_view_s_costs_are_those_of_the_left_pixels_that_match():
     costs = np.arange(12, dtype=np.uint8).reshape(1, 4, 3)
-    assert see_from_right(costs).tolist() == [[[0, 4, 8], [3, 7, 11], [6, 10, 255], [9, 255, 255]]]
+    assert see_from_right(costs, 99).tolist() == [[[0, 4, 8], [3, 7, 11], [6, 10, 99], [9, 99, 99]]]
 
 
 def slanted(rng, a, b, c):

@@ -11,14 +11,26 @@ from stereoweave.learn.models.layers import (
     correlate_nearby,
     correlate_warped,
     correlation_volume,
+    cost_volume,
     expected_step,
     gather_neighbours,
     local_soft_argmax,
     mirror,
     sample_at_match,
+    soft_argmin,
     upsample_convex,
     upsample_to_a_side,
 )
+
+
+def cost_volume_plain(left, right, levels, stride=1):
+    batch, channels, height, width = left.shape
+    volume = torch.zeros(batch, 2 * channels, levels, height, width)
+    for level in range(levels):
+        volume[:, :channels, level] = left
+        for x in range(stride * level, width):
+            volume[:, channels:, level, :, x] = right[:, :, :, x - stride * level]
+    return volume
 
 
 @pytest.fixture(autouse=True)
@@ -121,6 +133,39 @@ def test_columns_are_found_in_bfloat16_too_which_cannot_represent_their_indices(
     disparity = torch.full((1, 1, 1, 600), 3.0, dtype=torch.bfloat16)
     expected = matches(first.float(), second.float(), disparity.float(), 1)
     torch.testing.assert_close(matches(first, second, disparity, 1).float(), expected, atol=0.1, rtol=0.02)
+
+
+@pytest.mark.parametrize(("levels", "stride"), [(1, 1), (4, 1), (7, 1), (9, 1), (3, 3), (4, 2), (1, 3)])
+def test_the_cost_volume_equals_the_plain_one(levels, stride):
+    torch.manual_seed(0)
+    left, right = torch.rand(2, 2, 3, 4, 7)
+    found = cost_volume(left, right, levels, stride)
+    assert torch.equal(found, cost_volume_plain(left, right, levels, stride))
+
+
+def test_features_shifted_by_two_columns_are_equal_at_level_two():
+    torch.manual_seed(0)
+    scene = torch.rand(1, 3, 4, 12)
+    volume = cost_volume(scene[..., :-2], scene[..., 2:], levels=4)
+    left, right = volume.chunk(2, dim=1)
+    different = (left - right).abs().amax((0, 1, 3))[:, 4:].amax(1)
+    assert different[2] == 0
+    assert (different[[0, 1, 3]] > 0).all()
+
+
+@pytest.mark.parametrize(
+    ("costs", "disparity_px"),
+    [
+        ([5.0, 5.0, 5.0], 1.0),
+        ([60.0, 60.0, 0.0], 2.0),
+        ([0.0, math.log(3), 60.0], 0.25),  # three to one
+        ([math.log(2), 0.0, math.log(2)], 1.0),
+        ([0.0, math.log(2), math.log(4)], 4 / 7),  # shares of 4, 2 and 1 sevenths
+    ],
+)
+def test_soft_argmin_is_the_expected_candidate(costs, disparity_px):
+    expected = soft_argmin(torch.tensor(costs).view(1, -1, 1, 1))
+    torch.testing.assert_close(expected, torch.full((1, 1, 1, 1), disparity_px))
 
 
 def test_the_expected_step_is_the_mean_of_the_steps():
