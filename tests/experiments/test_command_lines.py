@@ -20,6 +20,7 @@ EXPERIMENTS = (
     "interleaved",
     "paper",
     "paper_sets",
+    "paper_transfer",
     "paper_worlds",
     "speed",
     "sphere_windows",
@@ -70,6 +71,10 @@ def folder(tmp_path, monkeypatch):
         (f"paper_worlds {PAPER_RECIPE} -o rows.csv", ["experiment", "dataset = 'paper_worlds'"]),
         ("paper_sets", ["--report", "--help"]),
         ("paper_sets --report rows --size big", ["--size: expected width x height"]),
+        (
+            f"paper_transfer {PAPER_RECIPE} none.pt -o runs --report report",
+            ["none.pt", "expected a checkpoint of stereoweave train"],
+        ),
         ("whole_films none.mp4 -o rows.csv", ["none.mp4", "no such"]),
         (
             "whole_films none.mp4 -o rows.csv --output hologram",
