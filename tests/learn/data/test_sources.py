@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from dataset_examples import shades, write_map, write_picture
-from learn_examples import CAMERA, PAIR_SIZE, RECIPE, box_before_a_wall, complaint, keep_pairs
+from learn_examples import CAMERA, PAIR_SIZE, RECIPE, Listed, box_before_a_wall, complaint, keep_pairs
 from rich.console import Console
 
 from stereoweave.data.packing import pack
@@ -15,6 +15,7 @@ from stereoweave.learn.data.collage import paint_training_collage
 from stereoweave.learn.data.pair_cache import CachedPairs
 from stereoweave.learn.data.sources import (
     VALIDATION_SEED,
+    KeptPairs,
     MixedSource,
     PairSource,
     cache_pairs,
@@ -109,6 +110,25 @@ def test_a_frame_is_read_on_demand(recipe, tmp_path):
     # f B = 30 px m, at a depth of 5 m.
     np.testing.assert_allclose(sample.disparity_px[0, :2], [np.nan, 6])
     assert sample.camera.focal_px == 300
+
+
+def test_a_training_frame_is_decoded_once(recipe, tmp_path):
+    training, _ = open_sources(recipe, tmp_path)
+    assert training[7] is training[7]
+
+
+def test_pairs_beyond_the_memory_are_read_every_time(rng):
+    class Counted(Listed):
+        def __getitem__(self, index):
+            read.append(index)
+            return super().__getitem__(index)
+
+    read, samples = [], [box_before_a_wall(rng, (8, 16), wall_px=1, box_px=2) for _ in range(3)]
+    # A pixel has two colours of 3 bytes, two disparities of 4, and two occlusions of 1.
+    kept = KeptPairs(Counted(samples), 2 * 8 * 16 * (6 + 8 + 2))
+    assert [kept[index] for index in (0, 1, 2, 0, 1, 2)] == 2 * samples
+    assert read == [0, 1, 2, 2]
+    assert (kept.count, kept.name(2)) == (3, "sample 2")
 
 
 @pytest.mark.parametrize(
