@@ -1,9 +1,8 @@
 """The paper's experiment: runs every training of trials.py on the same pairs in the same order."""
 
-import multiprocessing
 from collections.abc import Iterable
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -16,6 +15,7 @@ from stereoweave.learn.data.sources import cache_pairs, open_sources
 from stereoweave.learn.recipe import COLLAGE, Recipe
 from stereoweave.learn.training.loop import train_recipe
 from stereoweave.learn.training.objective import fit_recipe
+from stereoweave.synth.sets.workers import count_step, run_in_workers
 
 
 def plan(base: Recipe, runs: Path, extent: Extent, console: Console) -> list[Trial]:
@@ -83,17 +83,13 @@ def _resolve_start(trial: Trial, runs: Path) -> Trial:
 
 
 def _train_all(recipes: Iterable[Recipe], runs: Path, jobs: int, console: Console) -> None:
-    with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as workers:
-        started = {
-            workers.submit(_train, recipe, runs / recipe.name, jobs): recipe.name for recipe in recipes
-        }
-        for done in as_completed(started):
-            if error := done.exception():
-                workers.shutdown(cancel_futures=True)
-                raise error
-            console.print(started[done])
+    tasks = list(recipes)
+    for name in run_in_workers(partial(_train, runs, jobs), tasks, jobs, console, "training", len(tasks)):
+        console.print(name)
 
 
-def _train(recipe: Recipe, folder: Path, jobs: int) -> None:
+def _train(runs: Path, jobs: int, recipe: Recipe) -> str:
     torch.set_num_threads(max(1, torch.get_num_threads() // jobs))
-    train_recipe(recipe, folder, Console(quiet=True))
+    train_recipe(recipe, runs / recipe.name, Console(quiet=True))
+    count_step()
+    return recipe.name
