@@ -71,7 +71,7 @@ def list_trials(base: Recipe, extent: Extent, fitted_exponent: float) -> list[Tr
     rivals = {rival: _rival_changes(rival) for rival in RIVAL_SETTINGS}
     every = {"psmnet": rivals["psmnet"], "fast_depth": {}, **rivals}
     trials = [
-        *_repeat(seeds, base, PROJECTION, {PAPER: {}, "without": {"alpha_p": 0.0}}),
+        *_repeat(seeds, base, PROJECTION, _projection_settings(base)),
         *_repeat(seeds, base, NETWORKS, {"fast_depth": {}, "densemapnet": rivals["densemapnet"]}),
         *_repeat(seeds, base, ADJUSTMENT, {f"p = {p:g}": {"exponent": p} for p in (1.0, 1.5, 2.0, 1.25)}),
         *_repeat(
@@ -86,6 +86,14 @@ def list_trials(base: Recipe, extent: Extent, fitted_exponent: float) -> list[Tr
         *_repeat(1, base, NETWORKS, {"dispnet": rivals["dispnet"]}),
     ]
     return [trial for trial in trials if trial.claim in extent.claims]
+
+
+def _projection_settings(base: Recipe) -> dict[str, dict[str, Any]]:
+    settings: dict[str, dict[str, Any]] = {PAPER: {}, "without": {"alpha_p": 0.0}}
+    if base.target == "depth":
+        # Equation 5 read in metres: the loss of a code is that of a depth divided by the square of its range.
+        settings["depth in metres"] = {"alpha_p": base.alpha_p / base.max_depth_m**2}
+    return settings
 
 
 def _shorten(base: Recipe, steps: int) -> Recipe:

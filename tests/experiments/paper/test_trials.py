@@ -127,10 +127,19 @@ def test_a_base_that_fits_its_exponent_does_not_make_the_others_fit():
 def test_pairs_on_disk_have_all_trials_but_the_transfer():
     on_disk = list_trials(replace(BASE, dataset="paper", root="propeller", target="depth"), TWICE, 1.37)
     collages = list_trials(BASE, TWICE, 1.37)
-    assert [trial.recipe.name for trial in on_disk] == [
-        trial.recipe.name for trial in collages if trial.claim != TRANSFER
-    ]
+    same = [trial.recipe.name for trial in on_disk if trial.setting != "depth in metres"]
+    assert same == [trial.recipe.name for trial in collages if trial.claim != TRANSFER]
     assert {trial.recipe.target for trial in on_disk} == {"depth"}
+
+
+def test_depth_in_metres_weighs_225_times_as_much_as_its_code_up_to_15_m():
+    on_disk = replace(BASE, dataset="paper", root="propeller", target="depth", max_depth_m=15.0)
+    found = {
+        trial.setting: trial.recipe.alpha_p
+        for trial in list_trials(on_disk, ONCE, 1.37)
+        if trial.claim == PROJECTION
+    }
+    assert found == {PAPER: 1.0, "without": 0.0, "depth in metres": 1 / 225}
 
 
 def test_the_perceptual_loss_waits_for_its_file():
