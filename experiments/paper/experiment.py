@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 from rich.console import Console
 
+from experiments.paper.scoring import score_run
 from experiments.paper.trials import CLAIMS, SLOW_SHARE, Extent, list_trials
 from experiments.trial import Trial
 from stereoweave.errors import StereoweaveError
@@ -42,7 +43,7 @@ def plan(base: Recipe, runs: Path, extent: Extent, console: Console) -> list[Tri
 
 
 def run_trials(planned: Iterable[Trial], runs: Path, jobs: int, console: Console) -> None:
-    """Train each trial in its own folder of `runs`. Interrupted training runs resume.
+    """Train each trial in its own folder of `runs`, and score it. Interrupted training runs resume.
 
     Args:
         planned: Trials whose training pairs all exist, so that no two training runs create the same ones.
@@ -91,5 +92,6 @@ def _train_all(recipes: Iterable[Recipe], runs: Path, jobs: int, console: Consol
 def _train(runs: Path, jobs: int, recipe: Recipe) -> str:
     torch.set_num_threads(max(1, torch.get_num_threads() // jobs))
     train_recipe(recipe, runs / recipe.name, Console(quiet=True))
+    score_run(runs / recipe.name, runs / "pairs")
     count_step()
     return recipe.name

@@ -16,6 +16,7 @@ from experiments.paper.claims import (
     settings_table,
 )
 from experiments.paper.figures import draw_exponent_curves, draw_iterations, draw_validation, draw_views
+from experiments.paper.scoring import score_run
 from experiments.paper.trials import (
     ADJUSTMENT,
     FITTED,
@@ -36,7 +37,7 @@ from stereoweave.io.files import make_folder, replacing
 from stereoweave.learn import checkpoint
 from stereoweave.learn.checkpoint import Checkpoint
 from stereoweave.learn.data.sources import PairSource, open_sources
-from stereoweave.learn.evaluation import evaluate, identify_held_out, make_method
+from stereoweave.learn.evaluation import make_method, score_methods
 from stereoweave.learn.recipe import COLLAGE, Recipe
 from stereoweave.learn.training.loop import SCORES_FILE, read_scores
 from stereoweave.learn.training.objective import count_truth
@@ -111,8 +112,8 @@ def _gather(base: Recipe, planned: Sequence[Trial], runs: Path) -> Report:
             f"{runs}: expected at least one finished trial, found none of {len(files)}; "
             "run `python -m experiments.paper`"
         )
-    scores, common = _score([base, *(trial.recipe for trial in trained)], runs)
     names = {trial.recipe.name for trial in trained}
+    scores = {name: score_run(runs / name, runs / "pairs") for name in names}
     training, held_out = open_sources(base, runs / "pairs", whole=True)
     return Report(
         base=base,
@@ -124,28 +125,13 @@ def _gather(base: Recipe, planned: Sequence[Trial], runs: Path) -> Report:
         kept={name: kept[name] for name in names},
         curves={name: read_scores(runs / name / SCORES_FILE) for name in names},
         rows=[_make_row(trial, kept[trial.recipe.name], scores[trial.recipe.name]) for trial in trained],
-        common=common,
+        common=score_methods(base, {}, runs / "pairs", Console(quiet=True)),
     )
 
 
 def _is_finished(trial: Trial, kept: Mapping[str, Checkpoint]) -> bool:
     found = kept.get(trial.recipe.name)
     return found is not None and found.step == trial.recipe.steps
-
-
-def _score(recipes: Sequence[Recipe], runs: Path) -> tuple[dict[str, ProjectionRow], list[ProjectionRow]]:
-    """Return scores of all runs but the first recipe's, and of untrained methods on that recipe's pairs."""
-    base, *others = recipes
-    scores: dict[str, ProjectionRow] = {}
-    common: list[ProjectionRow] = []
-    for pairs in dict.fromkeys(identify_held_out(recipe) for recipe in others):
-        names = list(dict.fromkeys(recipe.name for recipe in others if identify_held_out(recipe) == pairs))
-        # Quiet, because all pairs were created during planning.
-        found = evaluate([runs / name for name in names], runs / "pairs", Console(quiet=True))
-        scores |= {row.method: row for row in found if row.method in names}
-        if pairs == identify_held_out(base):
-            common = [row for row in found if row.method not in names]
-    return scores, common
 
 
 def _make_row(trial: Trial, kept: Checkpoint, score: ProjectionRow) -> PaperRow:

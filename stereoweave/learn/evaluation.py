@@ -1,6 +1,6 @@
 """Scores of trained networks on their held-out pairs, for `stereoweave bench networks`."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -43,13 +43,20 @@ def evaluate(runs: Sequence[Path], folder: Path, console: Console) -> list[Proje
     """
     networks = load_runs(runs)
     recipe = _find_common_recipe(networks)
+    return score_methods(recipe, {name: make_method(one) for name, one in networks.items()}, folder, console)
+
+
+def score_methods(
+    recipe: Recipe, methods: Mapping[str, DisparityMethod], folder: Path, console: Console
+) -> list[ProjectionRow]:
+    """Score methods, and the baselines before them, on all of a recipe's held-out pairs; see `evaluate`."""
     training, held_out = (cache_pairs(pairs, console) for pairs in open_sources(recipe, folder, whole=True))
-    methods = {
-        MEDIAN: make_median_method(training),
-        **{name: make_method(one) for name, one in networks.items()},
-    }
     samples = (read_known(held_out, index) for index in range(held_out.count))
-    return score_projections(methods, samples, recipe.max_depth_m if recipe.target == "depth" else None)
+    return score_projections(
+        {MEDIAN: make_median_method(training), **methods},
+        samples,
+        recipe.max_depth_m if recipe.target == "depth" else None,
+    )
 
 
 def load_runs(runs: Sequence[Path], taken: Sequence[str] = (MEDIAN,)) -> dict[str, Checkpoint]:
@@ -69,20 +76,24 @@ def load_runs(runs: Sequence[Path], taken: Sequence[str] = (MEDIAN,)) -> dict[st
 
 
 def make_method(trained: Checkpoint) -> DisparityMethod:
-    """Wrap a checkpoint's averaged network as a function from a sample to the left view's disparity in px."""
+    """Wrap a checkpoint's averaged network as a function from a sample to the left view's disparity in px.
+
+    The network runs on a GPU if there is one.
+    """
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     network = build_network(trained.recipe)
     network.load_state_dict(trained.averaged)
-    network.eval()
+    network.eval().to(device)
     if isinstance(network, MCCNN):
         return partial(match_sample, network, int(trained.recipe.max_disparity_px))
 
     def match(sample: Sample) -> Float[np.ndarray, "h w"]:
-        batch = collate([sample])
+        batch = {name: values.to(device) for name, values in collate([sample]).items()}
         with torch.no_grad():
             output = network(batch["left"], batch["right"])
             if isinstance(network, CodeNetwork):
-                return objective.disparity_px(output, batch)[0, 0].numpy()
-            return output[0][0, 0].numpy()
+                return objective.disparity_px(output, batch)[0, 0].cpu().numpy()
+            return output[0][0, 0].cpu().numpy()
 
     if isinstance(network, CodeNetwork):
         objective = CodeObjective(trained.recipe, network)

@@ -189,8 +189,10 @@ def open_sources(recipe: Recipe, folder: Path, whole: bool = False) -> tuple[Pai
             CachedPairs(folder, VALIDATION_SEED, recipe.validation_pairs, recipe.pair_size),
         )
     training, held_out, _ = divide_frames(recipe)
-    spread = spread_evenly(held_out, None if whole else recipe.validation_pairs)
-    return KeptPairs(DatasetFrames(training)), DatasetFrames(spread)
+    if whole:
+        return KeptPairs(DatasetFrames(training)), DatasetFrames(held_out)
+    spread = spread_evenly(held_out, recipe.validation_pairs)
+    return KeptPairs(DatasetFrames(training)), KeptPairs(DatasetFrames(spread))
 
 
 def spread_evenly(frames: Sequence[Frame], most: int | None) -> list[Frame]:
