@@ -45,7 +45,18 @@ _FITTED_PAIRS, _FITTED_BINS = 200, 256
 
 @runtime_checkable
 class Objective(Protocol):
-    """A training loss and the validation scores that go with it."""
+    """A training loss and the validation scores that go with it.
+
+    Attributes:
+        same_work: Whether prediction and losses do the same work on the GPU for every batch of the same
+            shapes, without waiting for it, so that a graph can record it.
+    """
+
+    same_work: bool
+
+    def check(self, batch: Batch) -> None:
+        """Raise StereoweaveError if the batch's ground truth cannot be trained on."""
+        ...
 
     def predict(self, network: Any, batch: Batch) -> Any:
         """Return the predictions that `losses` needs, in training precision."""
@@ -95,8 +106,13 @@ class WeaveObjective:
     an exponent of 1, it compares disparities in pixels.
     """
 
+    same_work = True
+
     def __init__(self, recipe: Recipe) -> None:
         self.recipe = recipe
+
+    def check(self, batch: Batch) -> None:
+        """Accept every batch: truth that the network cannot predict enters no loss."""
 
     def predict(self, network: WeaveNet, batch: Batch) -> WeaveStages:
         return network.stages(batch["left"], batch["right"])
@@ -131,19 +147,28 @@ class CodeObjective:
     DispNet's) own loss up to the factor 1 / d_max, to which Adam is invariant.
     """
 
+    same_work = True
+
     def __init__(self, recipe: Recipe, network: CodeNetwork) -> None:
         self.recipe, self.curve = recipe, build_curve(recipe)
         self.predicts, self.output_weights = network.predicts, network.output_weights
         self.compare = _choose_comparison(recipe)
 
+    def check(self, batch: Batch) -> None:
+        self.curve.encode(compute_target(self.recipe, batch))
+
     def predict(self, network: CodeNetwork, batch: Batch) -> tuple[Map, ...]:
         return network.outputs(batch["left"], batch["right"])
 
     def losses(self, predicted: tuple[Map, ...], batch: Batch) -> dict[str, Tensor]:
-        truth = self.curve.encode(compute_target(self.recipe, batch))
+        truth = self.curve.encode_estimate(compute_target(self.recipe, batch))
         terms = [self._terms(output.float(), truth, batch) for output in predicted]
-        weights = torch.tensor(self.output_weights, device=truth.device)
-        return {name: weights @ torch.stack([term[name] for term in terms]) for name in terms[0]}
+        return {
+            name: torch.stack(
+                [weight * term[name] for weight, term in zip(self.output_weights, terms, strict=True)]
+            ).sum()
+            for name in terms[0]
+        }
 
     def code(self, output: Map, batch: Batch) -> Map:
         """Convert a network's output to a code."""

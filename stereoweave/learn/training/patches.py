@@ -33,8 +33,13 @@ PATCHES = 32
 class PatchObjective:
     """Objective of MC-CNN: true matches are more similar than false ones on the same row."""
 
+    same_work = False  # the number of patches depends on the batch
+
     def __init__(self, recipe: Recipe) -> None:
         self.recipe = recipe
+
+    def check(self, batch: dict[str, Tensor]) -> None:
+        """Accept every batch: patches are drawn where the truth is known."""
 
     def predict(self, network: MCCNN, batch: dict[str, Tensor]) -> Similarities:
         """Return the similarities of left patches to a true and to a false match each."""

@@ -21,6 +21,7 @@ from stereoweave.learn.recipe import Recipe
 from stereoweave.learn.training.accumulation import StepSums
 from stereoweave.learn.training.model_state import STEPS_BETWEEN_SKIPS, ModelState
 from stereoweave.learn.training.objective import name_in_errors
+from stereoweave.learn.training.step_graph import StepGraph
 
 # Longest time between two checkpoints, which is the most that a killed run loses.
 _SAVE_EVERY_S = 600
@@ -41,6 +42,9 @@ class TrainingRun(ModelState):
         if self.fabric.world_size > 1 and self.fabric.device.type == "cuda":
             nn.SyncBatchNorm.convert_sync_batchnorm(self.network)  # type: ignore[no-untyped-call]
         torch.set_rng_state(start.random_state)
+        self.terms: tuple[str, ...] = ()
+        graphed = self.objective.same_work and fabric.device.type == "cuda"
+        self.compute = StepGraph(self._compute) if graphed else self._compute
         self.began_s = self.saved_s = time.monotonic()
         self.scores = start.scores
         self.skipped: list[int] = []
@@ -82,16 +86,23 @@ class TrainingRun(ModelState):
             if self.recipe.micro_batches > 1:
                 # Seeded per micro-batch, so that dropout does not depend on the number of ranks.
                 torch.manual_seed(int(np.random.SeedSequence(batches.key(step, part)).generate_state(1)[0]))
-            with self.fabric.autocast():
-                predicted = self.objective.predict(self.network, values)
             with name_in_errors(what):
-                terms = self.objective.losses(predicted, values)
-            loss = torch.stack(list(terms.values())).sum()
-            self.optimiser.zero_grad()
-            self.fabric.backward(loss)
-            sums.add([loss, *terms.values()])
+                self.objective.check(values)
+                losses = self.compute(values)
+            sums.add(losses)
         means = sums.finish(self.fabric, self.recipe.micro_batches)
-        return dict(zip(["loss", *terms], means, strict=True))
+        return dict(zip(["loss", *self.terms], means, strict=True))
+
+    def _compute(self, batch: dict[str, torch.Tensor]) -> list[torch.Tensor]:
+        """Compute the gradient of a micro-batch. Returns its loss, and the loss's terms."""
+        with self.fabric.autocast():
+            predicted = self.objective.predict(self.network, batch)
+        terms = self.objective.losses(predicted, batch)
+        loss = torch.stack(list(terms.values())).sum()
+        self.optimiser.zero_grad()
+        self.fabric.backward(loss)
+        self.terms = tuple(terms)
+        return [loss.detach(), *(term.detach() for term in terms.values())]
 
     def _skip(self, step: int, found: str, batches: Batches) -> None:
         found = f"step {step}: {found}; the pairs are {', '.join(batches.names(step))}"

@@ -128,6 +128,7 @@ class TimedRun(ModelState):
     def begin(self, batch: dict[str, Tensor]) -> Tensor:
         """Compute a step's gradient. Returns the step's loss; on a GPU, both are computed asynchronously."""
         self.network.train()
+        self.objective.check(batch)
         self.optimiser.zero_grad()
         loss = self._loss(batch, self.bfloat16)
         loss.backward()  # type: ignore[no-untyped-call]

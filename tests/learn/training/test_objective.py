@@ -191,7 +191,7 @@ def test_the_greatest_depth_is_accepted_and_one_beyond_is_refused():
     at_the_end = compute_target(recipe, batch_of([[0.9, 1.8, torch.nan]], [5.4], [0.0]))
     torch.testing.assert_close(build_curve(recipe).encode(at_the_end)[0, 0, 0, :2], torch.tensor([0.0, 0.25]))
     beyond = batch_of([[0.89, 1.8, torch.nan]], [5.4], [0.0])
-    message = complaint(losses_of, recipe, Constant("code", 0.5), beyond)
+    message = complaint(build_objective(recipe, Constant("code", 0.5)).check, beyond)
     assert message.startswith(
         "depth: expected more than 0 and at most 6.0 m, or NaN where unknown, found 6.06"
     )
@@ -204,7 +204,8 @@ def test_a_disparity_beyond_the_greatest_counts_as_unknown():
 
 
 def test_a_disparity_below_0_is_refused():
-    message = complaint(losses_of, DISPARITY, Constant("code", 0.5), batch_of([[2.0, -0.5, 0.0]]))
+    objective = build_objective(DISPARITY, Constant("code", 0.5))
+    message = complaint(objective.check, batch_of([[2.0, -0.5, 0.0]]))
     assert message.startswith("disparity: expected 0 to 4.0 px, or NaN where unknown, found -0.5")
 
 
