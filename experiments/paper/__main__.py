@@ -33,21 +33,26 @@ def paper(  # noqa: PLR0913 - each is an option of the command line
             help=f"Train only for this claim; repeat for more. One of {', '.join(CLAIMS)}.",
         ),
     ] = None,
+    finished: Annotated[
+        bool, typer.Option("--finished", help="Train nothing; report what is finished.")
+    ] = False,
 ) -> None:
     """Train the paper's network, its rivals and all variants, and compare them with the paper's tables.
 
-    Rerun the same command to resume after an interruption.
+    Rerun the same command to resume after an interruption. Trainings whose scores the report's folder holds
+    are not repeated: remove trainings.jsonl there after a change of the code.
     """
     from rich.console import Console
 
     console = Console()
     with require_train_extra():
         from experiments.paper.experiment import plan, run_trials
-        from experiments.paper.report import write_report
+        from experiments.paper.report import list_unfinished, write_report
         from stereoweave.learn.recipe import read_recipe
     base = read_recipe(recipe)
     planned = plan(base, out, Extent(seeds=seeds, slow_steps=slow_steps, claims=only or CLAIMS), console)
-    run_trials(planned, out, jobs, console)
+    if not finished:
+        run_trials(list_unfinished(planned, out, report), out, jobs, console, scored=True)
     write_report(base, planned, out, report)
     typer.echo(f"tables: {report / 'paper.md'}")
 

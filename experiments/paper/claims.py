@@ -20,7 +20,8 @@ class PaperRow:
         prediction: Loss between codes, of the kind that was minimised in training.
         squared_error: Squared error between codes without the exponent, comparable across exponents.
         epe_px, epe_cm, mae_sourced, sourced_percent, mae_filled, psnr_db, ssim: See `ProjectionRow`.
-        minutes: Wall time, including that of the run that it started from; runs may share the processor.
+        minutes: Wall time, including that of the run that it started from; runs may share the machine.
+        machine: GPU or processor that finished the training.
     """
 
     claim: str
@@ -44,6 +45,7 @@ class PaperRow:
     ssim: float
     minutes: float
     commit: str
+    machine: str
 
 
 @dataclass(frozen=True, kw_only=True)

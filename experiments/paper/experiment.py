@@ -1,6 +1,6 @@
 """The paper's experiment: runs every training of trials.py on the same pairs in the same order."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from rich.console import Console
 
-from experiments.paper.scoring import score_run
+from experiments.paper.finished import finish
 from experiments.paper.trials import CLAIMS, SLOW_SHARE, Extent, list_trials
 from experiments.trial import Trial
 from stereoweave.errors import StereoweaveError
@@ -42,19 +42,23 @@ def plan(base: Recipe, runs: Path, extent: Extent, console: Console) -> list[Tri
     return planned
 
 
-def run_trials(planned: Iterable[Trial], runs: Path, jobs: int, console: Console) -> None:
-    """Train each trial in its own folder of `runs`, and score it. Interrupted training runs resume.
+def run_trials(
+    planned: Iterable[Trial], runs: Path, jobs: int, console: Console, scored: bool = False
+) -> None:
+    """Train each trial in its own folder of `runs`. Interrupted training runs resume.
 
     Args:
         planned: Trials whose training pairs all exist, so that no two training runs create the same ones.
         runs: Folder of the runs.
         jobs: Number of training runs in parallel, which share the processor's cores.
         console: Console that shows the progress.
+        scored: Whether to score each training on all its held-out pairs, for a report.
     """
     recipes = {trial.recipe.name: trial.recipe for trial in planned}.values()
     # A training that starts from another one must wait for its checkpoint.
-    _train_all([recipe for recipe in recipes if not recipe.start_from], runs, jobs, console)
-    _train_all([recipe for recipe in recipes if recipe.start_from], runs, jobs, console)
+    train = partial(_train, runs, jobs, scored)
+    _train_all([recipe for recipe in recipes if not recipe.start_from], train, jobs, console)
+    _train_all([recipe for recipe in recipes if recipe.start_from], train, jobs, console)
 
 
 def _check_base(base: Recipe, extent: Extent) -> None:
@@ -83,15 +87,17 @@ def _resolve_start(trial: Trial, runs: Path) -> Trial:
     return replace(trial, recipe=replace(trial.recipe, start_from=start_from))
 
 
-def _train_all(recipes: Iterable[Recipe], runs: Path, jobs: int, console: Console) -> None:
-    tasks = list(recipes)
-    for name in run_in_workers(partial(_train, runs, jobs), tasks, jobs, console, "training", len(tasks)):
+def _train_all(
+    recipes: Sequence[Recipe], train: Callable[[Recipe], str], jobs: int, console: Console
+) -> None:
+    for name in run_in_workers(train, recipes, jobs, console, "training", len(recipes)):
         console.print(name)
 
 
-def _train(runs: Path, jobs: int, recipe: Recipe) -> str:
+def _train(runs: Path, jobs: int, scored: bool, recipe: Recipe) -> str:
     torch.set_num_threads(max(1, torch.get_num_threads() // jobs))
     train_recipe(recipe, runs / recipe.name, Console(quiet=True))
-    score_run(runs / recipe.name, runs / "pairs")
+    if scored:
+        finish(runs / recipe.name, runs / "pairs")
     count_step()
     return recipe.name

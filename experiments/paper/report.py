@@ -1,7 +1,7 @@
 """Report of the paper's experiment: rows as CSV, tables as Markdown, and the paper's figures."""
 
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from experiments.paper.claims import (
     settings_table,
 )
 from experiments.paper.figures import draw_exponent_curves, draw_iterations, draw_validation, draw_views
-from experiments.paper.scoring import score_run
+from experiments.paper.finished import Finished, find_finished, keep_finished
 from experiments.paper.trials import (
     ADJUSTMENT,
     FITTED,
@@ -35,15 +35,15 @@ from stereoweave.bench.tables import write_csv
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io.files import make_folder, replacing
 from stereoweave.learn import checkpoint
-from stereoweave.learn.checkpoint import Checkpoint
 from stereoweave.learn.data.sources import PairSource, open_sources
-from stereoweave.learn.evaluation import make_method, score_methods
+from stereoweave.learn.evaluation import make_method, score_with_baselines
 from stereoweave.learn.recipe import COLLAGE, Recipe
-from stereoweave.learn.training.loop import SCORES_FILE, read_scores
 from stereoweave.learn.training.objective import count_truth
 
 # Indices of the held-out pairs that the figures show, modulo the number of pairs.
 SHOWN = (3, 11, 24)
+# Finished trainings, in the report's folder.
+FINISHED = "trainings.jsonl"
 # Optional input in the report's folder, from `python -m experiments.speed`.
 SPEED = "speed.csv"
 
@@ -58,8 +58,8 @@ class Report:
         planned: All trials.
         trained: Trials that are fully trained.
         missing: Recipe names of the unfinished trials.
-        kept: Checkpoints of the trained trials, by recipe name.
-        curves: Scores of the trained trials in order of steps, by recipe name.
+        runs: Folder of the runs, from which figures take the networks.
+        finished: Finished trainings, by recipe name; some may be none of the trials'.
         rows: One row per trained trial.
         common: Scores of untrained methods on the base's held-out pairs.
     """
@@ -70,8 +70,8 @@ class Report:
     planned: list[Trial]
     trained: list[Trial]
     missing: list[str]
-    kept: dict[str, Checkpoint]
-    curves: dict[str, list[dict[str, float]]]
+    runs: Path
+    finished: dict[str, Finished]
     rows: list[PaperRow]
     common: list[ProjectionRow]
 
@@ -82,38 +82,46 @@ class Report:
 
 
 def write_report(base: Recipe, planned: Sequence[Trial], runs: Path, out: Path) -> None:
-    """Write paper.csv, paper.md and the figures of the trained trials to a folder.
+    """Write trainings.jsonl, paper.csv, paper.md and the figures of the trained trials to a folder.
+
+    A figure of networks whose run folders are gone is left as it is.
 
     Args:
         base: Recipe that the trials start from.
         planned: All trials; paper.md lists the unfinished ones.
         runs: Folder of the runs.
-        out: Folder to write to. If it contains speed.csv, paper.md includes these run times.
+        out: Folder to write to. If it contains trainings.jsonl, the trainings there count as finished; if it
+            contains speed.csv, paper.md includes these run times.
 
     Raises:
         StereoweaveError: If no trial is finished.
         FormatError: If speed.csv is damaged.
     """
     run_time = _read_run_times(out / SPEED)
-    report = _gather(base, planned, runs)
+    report = _gather(base, planned, runs, out)
     make_folder(out)
-    write_csv(out / "paper.csv", report.rows)
+    keep_finished(out / FINISHED, report.finished.values())
+    write_csv(out / "paper.csv", report.rows, machine={})
     with replacing(out / "paper.md") as temporary:
         temporary.write_text(_format_report(report, run_time), encoding="utf-8")
     _draw(report, out)
 
 
-def _gather(base: Recipe, planned: Sequence[Trial], runs: Path) -> Report:
-    files = {trial.recipe.name: runs / trial.recipe.name / "last.pt" for trial in planned}
-    kept = {name: checkpoint.load(file) for name, file in files.items() if file.exists()}
-    trained = [trial for trial in planned if _is_finished(trial, kept)]
+def list_unfinished(planned: Sequence[Trial], runs: Path, out: Path) -> list[Trial]:
+    """Return the trials that neither a run's folder nor the report's folder holds as finished."""
+    finished = find_finished(runs, out / FINISHED)
+    return [trial for trial in planned if trial.recipe.name not in finished]
+
+
+def _gather(base: Recipe, planned: Sequence[Trial], runs: Path, out: Path) -> Report:
+    names = {trial.recipe.name for trial in planned}
+    finished = find_finished(runs, out / FINISHED)
+    trained = [trial for trial in planned if trial.recipe.name in finished]
     if not trained:
         raise StereoweaveError(
-            f"{runs}: expected at least one finished trial, found none of {len(files)}; "
+            f"{runs}: expected at least one finished trial, found none of {len(names)}; "
             "run `python -m experiments.paper`"
         )
-    names = {trial.recipe.name for trial in trained}
-    scores = {name: score_run(runs / name, runs / "pairs") for name in names}
     training, held_out = open_sources(base, runs / "pairs", whole=True)
     return Report(
         base=base,
@@ -121,21 +129,16 @@ def _gather(base: Recipe, planned: Sequence[Trial], runs: Path) -> Report:
         held_out=held_out,
         planned=list(planned),
         trained=trained,
-        missing=sorted(files.keys() - names),
-        kept={name: kept[name] for name in names},
-        curves={name: read_scores(runs / name / SCORES_FILE) for name in names},
-        rows=[_make_row(trial, kept[trial.recipe.name], scores[trial.recipe.name]) for trial in trained],
-        common=score_methods(base, {}, runs / "pairs", Console(quiet=True)),
+        missing=sorted(names - finished.keys()),
+        runs=runs,
+        finished=finished,
+        rows=[_make_row(trial, finished[trial.recipe.name]) for trial in trained],
+        common=score_with_baselines(base, {}, runs / "pairs", Console(quiet=True)),
     )
 
 
-def _is_finished(trial: Trial, kept: Mapping[str, Checkpoint]) -> bool:
-    found = kept.get(trial.recipe.name)
-    return found is not None and found.step == trial.recipe.steps
-
-
-def _make_row(trial: Trial, kept: Checkpoint, score: ProjectionRow) -> PaperRow:
-    recipe = kept.recipe
+def _make_row(trial: Trial, finished: Finished) -> PaperRow:
+    recipe, score = trial.recipe, finished.row
     return PaperRow(
         claim=trial.claim,
         setting=trial.setting,
@@ -147,8 +150,8 @@ def _make_row(trial: Trial, kept: Checkpoint, score: ProjectionRow) -> PaperRow:
         steps=recipe.steps,
         batch=recipe.batch,
         crop=f"{recipe.crop_size[1]}x{recipe.crop_size[0]}",
-        prediction=kept.scores["prediction"],
-        squared_error=kept.scores["squared_error"],
+        prediction=finished.validation["prediction"],
+        squared_error=finished.validation["squared_error"],
         epe_px=score.epe_px,
         epe_cm=score.epe_cm,
         mae_sourced=score.mae_sourced,
@@ -156,8 +159,9 @@ def _make_row(trial: Trial, kept: Checkpoint, score: ProjectionRow) -> PaperRow:
         mae_filled=score.mae_filled,
         psnr_db=score.psnr_db,
         ssim=score.ssim,
-        minutes=60 * kept.hours,
-        commit=kept.commit,
+        minutes=finished.minutes,
+        commit=finished.commit,
+        machine=finished.machine,
     )
 
 
@@ -269,7 +273,9 @@ def _format_common_table(rows: Sequence[ProjectionRow], depth: bool) -> str:
 def _describe_transfer(report: Report) -> str:
     """Describe how many steps the tuned network takes to reach the best loss of training from scratch."""
     curves = {
-        trial.setting: report.curves[trial.recipe.name] for trial in report.trained if trial.claim == TRANSFER
+        trial.setting: report.finished[trial.recipe.name].curve
+        for trial in report.trained
+        if trial.claim == TRANSFER
     }
     if len(curves) < 2:
         return ""
@@ -301,16 +307,18 @@ def _draw(report: Report, out: Path) -> None:
             draw_validation(out / f"{name}_validation.png", curves)
     samples = [held_out[index] for index in dict.fromkeys(shown % held_out.count for shown in SHOWN)]
     for claim, draw, name in ((ITERATIONS, draw_iterations, "iterations"), (NETWORKS, draw_views, "views")):
-        if claim in claims:
-            methods = _load_first_seeds(report, claim)
+        if methods := _load_first_seeds(report, claim):
             estimates = [{setting: match(sample) for setting, match in methods.items()} for sample in samples]
             draw(out / f"{name}.jpg", list(zip(samples, estimates, strict=True)))
 
 
 def _load_first_seeds(report: Report, claim: str) -> dict[str, DisparityMethod]:
-    """Load the first seed's network for each setting."""
+    """Load the first seed's network for each setting; none unless the runs of all are there."""
     names = {t.setting: t.recipe.name for t in reversed(report.trained) if t.claim == claim}
-    return {setting: make_method(report.kept[name]) for setting, name in reversed(names.items())}
+    files = {setting: report.runs / name / "last.pt" for setting, name in reversed(names.items())}
+    if not all(file.exists() for file in files.values()):
+        return {}
+    return {setting: make_method(checkpoint.load(file)) for setting, file in files.items()}
 
 
 def _curves_by_setting(report: Report, claim: str) -> dict[str, list[list[tuple[int, float]]]]:
@@ -319,6 +327,6 @@ def _curves_by_setting(report: Report, claim: str) -> dict[str, list[list[tuple[
     once = {trial.recipe.name: trial for trial in reversed(report.trained) if trial.claim == claim}
     found: dict[str, list[list[tuple[int, float]]]] = {}
     for name, trial in reversed(once.items()):
-        curve = [(int(point["step"]), point["squared_error"]) for point in report.curves[name]]
+        curve = [(int(point["step"]), point["squared_error"]) for point in report.finished[name].curve]
         found.setdefault(trial.setting, []).append(curve)
     return found

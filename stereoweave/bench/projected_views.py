@@ -86,13 +86,14 @@ def score_projections(
             f"{min(taken)}: expected a name that no other row of the table uses, found a duplicate; rename it"
         )
     everyone |= methods
-    scores = [
-        {name: _score_sample(method(sample), sample, max_depth_m) for name, method in everyone.items()}
-        for sample in samples
-    ]
-    if not scores:
-        raise StereoweaveError("samples: expected at least one, found none; is the split empty?")
-    return [ProjectionRow(method=name, **_average([score[name] for score in scores])) for name in everyone]
+    return _score(everyone, samples, max_depth_m)
+
+
+def score_projection(
+    name: str, method: DisparityMethod, samples: Iterable[Sample], max_depth_m: float | None = None
+) -> ProjectionRow:
+    """Return the row of one method, without baselines; see `score_projections`."""
+    return _score({name: method}, samples, max_depth_m)[0]
 
 
 def measure_projection(right: UInt8[np.ndarray, "h w 3"], projected: View) -> ProjectionErrors:
@@ -105,6 +106,18 @@ def measure_projection(right: UInt8[np.ndarray, "h w 3"], projected: View) -> Pr
         psnr_db=psnr_db(filled, right),
         ssim=ssim(filled, right),
     )
+
+
+def _score(
+    methods: Mapping[str, DisparityMethod], samples: Iterable[Sample], max_depth_m: float | None
+) -> list[ProjectionRow]:
+    scores = [
+        {name: _score_sample(method(sample), sample, max_depth_m) for name, method in methods.items()}
+        for sample in samples
+    ]
+    if not scores:
+        raise StereoweaveError("samples: expected at least one, found none; is the split empty?")
+    return [ProjectionRow(method=name, **_average([score[name] for score in scores])) for name in methods]
 
 
 def _score_sample(

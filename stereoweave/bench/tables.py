@@ -132,9 +132,10 @@ def write_csv(path: str | Path, rows: Sequence[Any], machine: dict[str, str] | N
     Args:
         path: The CSV file; its folder is created.
         rows: One or more instances of the same dataclass, whose fields are the columns.
-        machine: Processor, number of cores and OpenCV version. Default: those of this machine.
+        machine: Processor, number of cores and OpenCV version; {} for rows that name their machine. Default:
+            those of this machine.
     """
-    machine = machine or describe_machine()
+    machine = describe_machine() if machine is None else machine
     columns = [field.name for field in fields(rows[0])] + list(machine)
     values = [{k: f"{v:.6g}" if isinstance(v, float) else v for k, v in asdict(row).items()} for row in rows]
     write_table(path, columns, (row | machine for row in values))

@@ -1,6 +1,6 @@
 """Scores of trained networks on their held-out pairs, for `stereoweave bench networks`."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -9,7 +9,12 @@ import torch
 from jaxtyping import Float
 from rich.console import Console
 
-from stereoweave.bench.projected_views import DisparityMethod, ProjectionRow, score_projections
+from stereoweave.bench.projected_views import (
+    DisparityMethod,
+    ProjectionRow,
+    score_projection,
+    score_projections,
+)
 from stereoweave.errors import StereoweaveError
 from stereoweave.learn import checkpoint
 from stereoweave.learn.checkpoint import Checkpoint
@@ -43,20 +48,38 @@ def evaluate(runs: Sequence[Path], folder: Path, console: Console) -> list[Proje
     """
     networks = load_runs(runs)
     recipe = _find_common_recipe(networks)
-    return score_methods(recipe, {name: make_method(one) for name, one in networks.items()}, folder, console)
+    methods = {name: make_method(one) for name, one in networks.items()}
+    return score_with_baselines(recipe, methods, folder, console)
 
 
-def score_methods(
+def score_with_baselines(
     recipe: Recipe, methods: Mapping[str, DisparityMethod], folder: Path, console: Console
 ) -> list[ProjectionRow]:
-    """Score methods, and the baselines before them, on all of a recipe's held-out pairs; see `evaluate`."""
+    """Score baselines, then methods, on all of a recipe's held-out pairs; see `evaluate`."""
     training, held_out = (cache_pairs(pairs, console) for pairs in open_sources(recipe, folder, whole=True))
-    samples = (read_known(held_out, index) for index in range(held_out.count))
-    return score_projections(
-        {MEDIAN: make_median_method(training), **methods},
-        samples,
-        recipe.max_depth_m if recipe.target == "depth" else None,
-    )
+    methods = {MEDIAN: make_median_method(training), **methods}
+    return score_projections(methods, _read_all(held_out), _find_depth_limit(recipe))
+
+
+def score_run(trained: Checkpoint, name: str, folder: Path) -> ProjectionRow:
+    """Score a checkpoint on all its held-out pairs, without baselines.
+
+    Args:
+        trained: The checkpoint.
+        name: Method of the row.
+        folder: Cache folder of collage pairs, which must all exist.
+    """
+    _, held_out = open_sources(trained.recipe, folder, whole=True)
+    limit_m = _find_depth_limit(trained.recipe)
+    return score_projection(name, make_method(trained), _read_all(held_out), limit_m)
+
+
+def _read_all(pairs: PairSource) -> Iterator[Sample]:
+    return (read_known(pairs, index) for index in range(pairs.count))
+
+
+def _find_depth_limit(recipe: Recipe) -> float | None:
+    return recipe.max_depth_m if recipe.target == "depth" else None
 
 
 def load_runs(runs: Sequence[Path], taken: Sequence[str] = (MEDIAN,)) -> dict[str, Checkpoint]:

@@ -37,6 +37,7 @@ def row(claim, setting, seed=0, model="fast_depth", steps=600, **scores):
         batch=4,
         crop="192x128",
         commit="0123abc",
+        machine="x86_64 AVX512",
         **found,
     )
 

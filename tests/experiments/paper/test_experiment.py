@@ -1,6 +1,7 @@
 import csv
 import os
-from dataclasses import dataclass, replace
+import shutil
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,8 @@ from experiments.paper import experiment as paper
 from experiments.paper import report as paper_report
 from experiments.paper import trials as the_trials
 from experiments.paper.experiment import plan, run_trials
-from experiments.paper.report import Report, write_report
+from experiments.paper.finished import Finished
+from experiments.paper.report import FINISHED, Report, list_unfinished, write_report
 from experiments.paper.trials import (
     ADJUSTMENT,
     FITTED,
@@ -34,6 +36,7 @@ from experiments.paper.trials import (
     list_trials,
 )
 from experiments.trial import Trial
+from stereoweave.bench.projected_views import ProjectionRow
 from stereoweave.data.paper_layout import write_frame
 from stereoweave.io.images import read_image
 from stereoweave.learn import checkpoint
@@ -122,9 +125,9 @@ def experiment(tmp_path_factory):
         patch.setattr(the_trials, "FIGURE_3_STEPS", (1, 2))
         planned = plan(BASE, runs, Extent(seeds=1, claims=CLAIMS), QUIET)
         experiment = Experiment(planned, runs, out)
-        run_trials(experiment.of(FIRST), runs, JOBS, QUIET)
+        run_trials(experiment.of(FIRST), runs, JOBS, QUIET, scored=True)
         train_in_place(patch)
-        run_trials(experiment.of(*TRAINED[1:]), runs, JOBS, QUIET)
+        run_trials(experiment.of(*TRAINED[1:]), runs, JOBS, QUIET, scored=True)
     write_report(BASE, planned, runs, out)
     return experiment
 
@@ -233,7 +236,7 @@ def test_the_tables_name_what_was_not_run(experiment):
 
 
 def test_every_figure_of_what_was_trained_can_be_read(experiment):
-    names = {file.name for file in experiment.out.iterdir()} - {"paper.csv", "paper.md"}
+    names = {file.name for file in experiment.out.iterdir()} - {"paper.csv", "paper.md", FINISHED}
     assert names == {
         "exponent_curves.png",
         "exponent_validation.png",
@@ -268,7 +271,7 @@ def test_a_resumed_experiment_trains_only_what_is_missing(experiment, in_place, 
 
     with monkeypatch.context() as patch, pytest.raises(Killed):
         patch.setattr(TrainingRun, "save", kill)
-        run_trials(some, experiment.runs, JOBS, QUIET)
+        run_trials(some, experiment.runs, JOBS, QUIET, scored=True)
     # Killed as soon as its first checkpoint was written.
     assert steps == [(SECOND_POWER, 0), (SECOND_POWER, 1)]
     assert checkpoint.load(experiment.last(SECOND_POWER)).step == 2
@@ -276,13 +279,26 @@ def test_a_resumed_experiment_trains_only_what_is_missing(experiment, in_place, 
     write_report(BASE, experiment.of(FIRST, SECOND_POWER), experiment.runs, out)
     assert f"## Not run\n\n- {SECOND_POWER}\n" in (out / "paper.md").read_text()
 
-    run_trials(some, experiment.runs, JOBS, QUIET)
+    run_trials(some, experiment.runs, JOBS, QUIET, scored=True)
     assert steps[2:] == [(SECOND_POWER, 2), (SECOND_POWER, 3)]
     assert {name: experiment.last(name).read_bytes() for name in TRAINED} == before
     recorded = read_scores(experiment.runs / SECOND_POWER / SCORES_FILE)
     assert [row["step"] for row in recorded] == [2, 4]
     write_report(BASE, experiment.of(FIRST, SECOND_POWER), experiment.runs, out)
     assert "## Not run" not in (out / "paper.md").read_text()
+
+
+def test_a_training_whose_run_is_gone_is_reported_again_and_not_repeated(experiment, tmp_path):
+    out, runs = tmp_path / "report", tmp_path / "runs"
+    shutil.copytree(experiment.out, out)
+    (runs / "pairs").parent.mkdir()
+    shutil.copytree(experiment.runs / "pairs", runs / "pairs")
+    missing = [trial for trial in experiment.planned if trial.recipe.name not in TRAINED]
+    assert list_unfinished(experiment.planned, runs, out) == missing
+    before = {file.name: file.read_bytes() for file in out.iterdir()}
+    write_report(BASE, experiment.planned, runs, out)
+    for name in ("paper.csv", "paper.md", FINISHED, "views.jpg", "iterations.jpg"):
+        assert (out / name).read_bytes() == before[name], name
 
 
 def test_what_starts_from_another_training_comes_after_it(monkeypatch, tmp_path):
@@ -304,6 +320,20 @@ def test_a_tuned_trial_starts_from_a_run_below_the_folder_of_the_runs():
         assert start_from == str(Path.cwd() / "runs" / FIRST / "last.pt")
 
 
+def finished_of(name, curve):
+    """Return a training whose scores are all 0: only its curve is read."""
+    scores = {field.name: 0.0 for field in fields(ProjectionRow)} | {"method": name}
+    return Finished(
+        name=name,
+        commit="0123abc",
+        machine="",
+        minutes=0.0,
+        validation={},
+        row=ProjectionRow(**scores),
+        curve=curve,
+    )
+
+
 def report_of(trained, curves):
     return Report(
         base=BASE,
@@ -312,8 +342,8 @@ def report_of(trained, curves):
         planned=trained,
         trained=trained,
         missing=[],
-        kept={},
-        curves=curves,
+        runs=Path("runs"),
+        finished={name: finished_of(name, curve) for name, curve in curves.items()},
         rows=[],
         common=[],
     )
@@ -379,7 +409,7 @@ def on_disk(tmp_path_factory):
         patch.setattr(the_trials, "FIGURE_3_STEPS", (1, 2))
         planned = plan(base, runs, Extent(seeds=1), QUIET)
         experiment = Experiment(planned, runs, out)
-        run_trials(experiment.of(*ON_DISK), runs, JOBS, QUIET)
+        run_trials(experiment.of(*ON_DISK), runs, JOBS, QUIET, scored=True)
     write_report(base, planned, runs, out)
     return experiment
 
@@ -414,7 +444,13 @@ def test_the_tables_of_depth_stand_beside_the_papers_propeller(on_disk):
     assert [line for line in text.splitlines() if line.startswith("| no warping | 300.0 | 6.00 | ")]
     assert [line for line in text.splitlines() if line.startswith("| ground truth | 0.0 | 0.00 | ")]
     names = {file.name for file in on_disk.out.iterdir()}
-    assert names == {"paper.csv", "paper.md", "exponent_curves.png", "projection_validation.png"} | {
+    assert names == {
+        "paper.csv",
+        "paper.md",
+        FINISHED,
+        "exponent_curves.png",
+        "projection_validation.png",
+    } | {
         "views.jpg",
         "exponent_validation.png",
     }
