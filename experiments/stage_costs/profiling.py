@@ -42,7 +42,6 @@ _STAGES_BETWEEN = {
     ("", "aggregation"): "disparity from scores",
     ("", "completion"): "completion",
     ("", "propagation"): "upsampling",
-    ("", "sharpening"): "sharpening",
     ("", "refinement"): "upsampling",
     ("refinement", "to_half"): "matching at 1/2",
 }

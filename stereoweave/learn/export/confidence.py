@@ -23,19 +23,17 @@ _SIZE = (320, 512)
 def calibrate_confidence(network: WeaveNet) -> dict[str, Any]:
     """Calibrate the network's confidence in place. Returns the reliability on other pairs.
 
-    A scale and a shift of the logits (Platt 1999) are fitted and folded into the last layers. The reliability
+    A scale and a shift of the logits (Platt 1999) are fitted and folded into the last layer. The reliability
     is measured on pairs that were not used for the fit. It consists of the `calibration_error` and, for each
     confidence bin, the `claimed` probability that the error is within 1 px, the share of its pixels for which
     it is (`happened`), and the bin's `share` of all pixels.
     """
     scale, shift = _fit_scale_and_shift(*_predict_claims(network, _FIT_SEED))
     with torch.no_grad():
-        for index, layer in enumerate(network.confidence_layers):
-            assert layer.bias is not None
-            layer.weight *= scale
-            layer.bias *= scale
-            # The layers' outputs are summed, so only one layer is shifted.
-            layer.bias += shift if index == 0 else 0
+        layer = network.refinement.confidence
+        assert layer.bias is not None
+        layer.weight *= scale
+        layer.bias.mul_(scale).add_(shift)
     logits, within = _predict_claims(network, _PROOF_SEED)
     return measure_reliability(logits.sigmoid().numpy(), within.numpy())
 

@@ -223,10 +223,7 @@ def count_multiply_adds(network: nn.Module, height: int = 480, width: int = 640)
     # elementwise products. Without warping, it interpolates between products, so it needs one more product
     # than it has matches.
     nearby = 2 * network.refinement.radius + 1 + (not network.size.warps)
-    counted += 2 * (height // 2) * (width // 2) * network.size.compared * nearby
-    if network.sharpening is None:
-        return counted
-    return counted + 2 * height * width * network.size.sharpening * (2 * network.sharpening.radius + 1)
+    return counted + 2 * (height // 2) * (width // 2) * network.size.compared * nearby
 
 
 def _make_card(kept: Checkpoint, network: nn.Module) -> dict[str, Any]:

@@ -32,9 +32,9 @@ _RANGES_PAIRS, _PROOF_PAIRS = 6, 24
 _SIZE = (320, 512)
 # Percentile of a map's values that the quantisation range covers. Outliers are clipped to keep steps small.
 _RANGE_PERCENTILE = 99.99
-# These layers stay in float32, because they resolve fractions of a pixel. In 8 bits they would double the
+# Its layers stay in float32, because they resolve fractions of a pixel. In 8 bits they would double the
 # loss of accuracy.
-_KEPT = ("refinement.", "sharpening.")
+_KEPT = "refinement."
 
 
 def quantise(source: Path, out: Path) -> dict[str, Any]:
@@ -72,7 +72,7 @@ def quantise(source: Path, out: Path) -> dict[str, Any]:
 def select_int8_nodes(graph: onnx.ModelProto) -> list[str]:
     """Return the names of the nodes to compute in 8 bits.
 
-    They are all convolutions except those of refinement and sharpening, the nodes between these convolutions,
+    They are all convolutions except those of the refinement, the nodes between these convolutions,
     and the ReLUs after them. Disparities, correlations and their inputs stay in float32, because 8 bits would
     round a disparity to whole pixels.
     """

@@ -29,7 +29,7 @@ from stereoweave.learn.models.layers import (
     upsample_to_a_side,
     zero_initialise,
 )
-from stereoweave.learn.models.weave_stages import Completion, Sharpening, WiderContext
+from stereoweave.learn.models.weave_stages import Completion, WiderContext
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +58,6 @@ class WeaveSize:
         wider: Number of channels of the context at 1/32 resolution; 0 omits this context.
         completion: Number of channels of the stage at 1/4 resolution that completes occluded areas; 0 omits
             this stage.
-        sharpening: Number of channels that are correlated at full resolution; 0 omits the sharpening.
     """
 
     channels: tuple[int, int, int, int]
@@ -76,7 +75,6 @@ class WeaveSize:
     neighbours: int
     wider: int = 0
     completion: int = 0
-    sharpening: int = 0
 
 
 SMALL = WeaveSize(
@@ -111,7 +109,7 @@ BASE = WeaveSize(
 )
 
 # BASE with all optional stages, which do not change its output until they are trained.
-BASE_GROWN = replace(BASE, wider=64, completion=32, sharpening=8)
+BASE_GROWN = replace(BASE, wider=64, completion=32)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -272,12 +270,12 @@ class Refinement(nn.Module):
 
     def forward(
         self, disparity: Tensor, first: Tensor, second: Tensor, context: Tensor, decoded: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return disparity in half-resolution pixels, upsampling weights, confidence logits and features."""
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return disparity in half-resolution pixels, upsampling weights and confidence logits."""
         matches = self.matches(first, second, disparity, self.radius)
         x = self.body(self.join(torch.cat([matches, context, decoded], 1)))
         correction = expected_step((matches + self.scores(x)).float())
-        return disparity + correction, self.weights(x), F.pixel_shuffle(self.confidence(x), 2), x
+        return disparity + correction, self.weights(x), F.pixel_shuffle(self.confidence(x), 2)
 
 
 class WeaveNet(nn.Module):
@@ -290,7 +288,7 @@ class WeaveNet(nn.Module):
 
     - SMALL: 278,029 parameters and 2.96 G multiply-adds
     - BASE: 1,274,290 parameters and 13.41 G multiply-adds
-    - BASE_GROWN: 1,470,020 parameters and 15.98 G multiply-adds
+    - BASE_GROWN: 1,466,405 parameters and 14.02 G multiply-adds
     """
 
     def __init__(self, size: WeaveSize = SMALL, levels: int = 48) -> None:
@@ -307,17 +305,10 @@ class WeaveNet(nn.Module):
         self.to_match_half = nn.Conv2d(half, size.compared, 1)
         self.to_half = nn.Conv2d(32, 4 * size.handed, 1)
         self.refinement = Refinement(size)
-        self.sharpening = Sharpening(8, 16, size.sharpening) if size.sharpening else None
 
     @property
     def max_disparity_px(self) -> int:
         return 4 * self.levels
-
-    @property
-    def confidence_layers(self) -> tuple[nn.Conv2d, ...]:
-        """Layers whose outputs add up to the confidence logit."""
-        sharpened = () if self.sharpening is None else (self.sharpening.confidence,)
-        return self.refinement.confidence, *sharpened
 
     def stages(self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]) -> WeaveStages:
         """Return the results of every stage for both views."""
@@ -332,22 +323,19 @@ class WeaveNet(nn.Module):
         spread, decoded = self._propagate(quarter, first.quarter, decoded, batch)
         coarse = self.upsample(spread * 2, self.weights(decoded).float())
         match_half = self.to_match_half(maps.half)
-        fine, weights, confidence, context = self.refinement(
+        fine, weights, confidence = self.refinement(
             coarse,
             as_left_view(match_half, batch),
             as_other_view(match_half, batch),
             first.half,
             F.pixel_shuffle(self.to_half(decoded), 2),
         )
-        disparity_px, logit = self._sharpen(
-            self.upsample(fine * 2, weights.float()), confidence.float(), images, context, batch
-        )
         return WeaveStages(
             correlation=correlation,
             scores=scores,
             coarse_px=coarse * 2,
-            disparity_px=disparity_px,
-            confidence_logit=logit,
+            disparity_px=self.upsample(fine * 2, weights.float()),
+            confidence_logit=confidence.float(),
         )
 
     def match(self, maps: WeaveFeatures, first: WeaveFeatures) -> tuple[Tensor, Tensor, Tensor]:
@@ -380,22 +368,6 @@ class WeaveNet(nn.Module):
         if self.propagation is None:
             return quarter, decoded
         return self.propagation(quarter, features, decoded)
-
-    def _sharpen(
-        self, disparity_px: Tensor, logit: Tensor, images: Tensor, context: Tensor, batch: int | torch.SymInt
-    ) -> tuple[Tensor, Tensor]:
-        if self.sharpening is None:
-            return disparity_px, logit
-        features, match = self.sharpening.views(images)
-        if self.training:
-            # Sharpening only the left views halves the cost; the right views supervise the earlier stages.
-            lefts = (disparity_px[:batch], match[:batch], match[batch:], features[:batch], context[:batch])
-            sharp_px, more = self.sharpening(*lefts)
-            right_px, right_logit = disparity_px[batch:], logit[batch:]
-            return torch.cat([sharp_px, right_px]), torch.cat([logit[:batch] + more, right_logit])
-        first, second = as_left_view(match, batch), as_other_view(match, batch)
-        sharp_px, more = self.sharpening(disparity_px, first, second, as_left_view(features, batch), context)
-        return sharp_px, logit + more
 
     def forward(self, left: Tensor, right: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return both views' disparities and the left view's confidence logit, each [B, 1, H, W]."""

@@ -9,8 +9,6 @@ from stereoweave.learn.models.layers import (
     ConvBlock,
     Halve,
     Residual,
-    correlate_warped,
-    expected_step,
     gather_neighbours,
     sample_at_match,
     zero_initialise,
@@ -88,43 +86,3 @@ class Completion(nn.Module):
         check = (sample_at_match(other, disparity) - disparity).clamp(-_LARGEST_CHECK, _LARGEST_CHECK)
         inside = (columns - disparity).clamp(-_LARGEST_CHECK, _LARGEST_CHECK)
         return departure, disparity / 16, check, inside
-
-
-class Sharpening(nn.Module):
-    """Correction of the disparity by at most `radius` full-resolution pixels, from correlations around it."""
-
-    def __init__(self, handed: int, inputs: int, channels: int, radius: int = 2) -> None:
-        super().__init__()
-        self.radius = radius
-        nearby = 2 * radius + 1
-        self.features = nn.Sequential(nn.Conv2d(3, channels, 3, padding=1), nn.ReLU(inplace=True))
-        self.to_match = nn.Conv2d(channels, channels, 1)
-        self.hand = nn.Conv2d(inputs, 4 * handed, 1)
-        self.join = nn.Sequential(nn.Conv2d(nearby + channels + handed, 16, 1), nn.ReLU(inplace=True))
-        self.body = nn.Sequential(nn.Conv2d(16, 16, 3, padding=1), nn.ReLU(inplace=True))
-        self.scores = zero_initialise(nn.Conv2d(16, nearby, 1))
-        self.gain = nn.Parameter(torch.zeros(()))
-        self.confidence = zero_initialise(nn.Conv2d(16, 1, 1))
-
-    def views(self, images: Float[Tensor, "b 3 h w"]) -> tuple[Tensor, Tensor]:
-        """Return the features of the images and the maps to correlate."""
-        features = self.features(images * 2 - 1)
-        return features, self.to_match(features)
-
-    def forward(
-        self, disparity: Tensor, first: Tensor, second: Tensor, features: Tensor, context: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Return the corrected disparity in pixels, and the change in the confidence logit.
-
-        Args:
-            disparity: Disparity in full-resolution pixels.
-            first: This view's maps to correlate.
-            second: The other view's maps to correlate.
-            features: This view's features.
-            context: The refinement's features at half resolution.
-        """
-        matches = correlate_warped(first, second, disparity, self.radius)
-        handed = F.pixel_shuffle(self.hand(context), 2)
-        x = self.body(self.join(torch.cat([matches, features, handed], 1)))
-        scores = (self.scores(x) + self.gain * matches).float()
-        return disparity + expected_step(scores), self.confidence(x).float()

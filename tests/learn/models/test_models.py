@@ -16,7 +16,7 @@ from stereoweave.learn.training.objective import build_objective
 PARAMETERS = {
     "weave_small": 278_029,
     "weave_base": 1_274_290,
-    "weave_base_grown": 1_470_020,
+    "weave_base_grown": 1_466_405,
     "fast_depth": 314_722,
     "fast_depth_without_skips": 301_858,
     "densemapnet": 290_290,

@@ -103,7 +103,7 @@ def test_forty_eight_levels_reach_192_px():
     assert untrained().max_disparity_px == 192
 
 
-@pytest.mark.parametrize("part", ["wider", "completion", "sharpening"])
+@pytest.mark.parametrize("part", ["wider", "completion"])
 def test_each_optional_stage_changes_nothing_until_it_is_trained(part):
     torch.manual_seed(0)
     before = WeaveNet(BASE).eval()
@@ -131,22 +131,20 @@ def test_every_stage_of_a_grown_network_learns():
         with torch.no_grad():
             for parameter in network.parameters():
                 parameter -= 1e-2 * parameter.grad
-    grown_by = ("sharpening.", "completion.", "aggregation.context.wider.")
+    grown_by = ("completion.", "aggregation.context.wider.")
     for name, parameter in network.named_parameters():
         assert not name.startswith(grown_by) or parameter.grad.any(), name
 
 
-def test_a_mirrored_pair_is_completed_and_sharpened_alike():
-    """Use mirror-symmetric features; the stages receive each view with the other one in its own columns."""
+def test_a_mirrored_pair_is_completed_alike():
+    """Use mirror-symmetric features; the completion receives each view with the other in its own columns."""
     torch.manual_seed(0)
     network = WeaveNet(BASE_GROWN).eval().double()
-    for layer in (network.completion.share, network.sharpening.scores):
-        nn.init.normal_(layer.weight, std=0.5)
+    nn.init.normal_(network.completion.share.weight, std=0.5)
     with torch.no_grad():
-        for part in (network.encoder, network.sharpening.features, network.sharpening.to_match):
-            for layer in part.modules():
-                if isinstance(layer, nn.Conv2d):
-                    layer.weight += mirror(layer.weight.clone())
+        for layer in network.encoder.modules():
+            if isinstance(layer, nn.Conv2d):
+                layer.weight += mirror(layer.weight.clone())
         left, right = (image.double() for image in random_pair(1, 64, 96))
         left_px, right_px, _ = network(left, right)
         mirrored_left_px, mirrored_right_px, _ = network(mirror(right), mirror(left))
