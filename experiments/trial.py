@@ -1,6 +1,8 @@
-"""Description of one training run of an experiment."""
+"""Description of one training run of an experiment, and the hash of its recipe."""
 
-from dataclasses import dataclass
+import hashlib
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 from stereoweave.learn.recipe import Recipe
 
@@ -18,3 +20,9 @@ class Trial:
     claim: str
     setting: str
     recipe: Recipe
+
+
+def fingerprint(recipe: Recipe) -> str:
+    """Return the hash of a recipe without its name and the place of the runs, in 8 hexadecimal digits."""
+    start_from = "/".join(Path(recipe.start_from).parts[-2:])
+    return hashlib.sha256(repr(replace(recipe, name="", start_from=start_from)).encode()).hexdigest()[:8]

@@ -312,13 +312,17 @@ class DepthCurve:
         Raises:
             StereoweaveError: A value is outside the range.
         """
+        self.check(values)
+        return self.encode_estimate(values)
+
+    def check(self, values: ArrayOrTensor) -> None:
+        """Raise StereoweaveError if a value is outside the range of `encode`."""
         if self.max_disparity_px is not None:
             outside = values[(values < 0) | (values > self.max_disparity_px)]
             _refuse(outside, f"disparity: expected 0 to {self.max_disparity_px} px")
         else:
             outside = values[(values <= 0) | (values > self.max_depth_m)]
             _refuse(outside, f"depth: expected more than 0 and at most {self.max_depth_m} m")
-        return self.encode_estimate(values)
 
     def encode_estimate(self, values: ArrayOrTensor) -> ArrayOrTensor:
         """Encode estimated values; outside the range, extrapolate the curve instead of raising an error."""

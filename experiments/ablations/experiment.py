@@ -1,7 +1,6 @@
 """Ablations: WeaveNet with one design choice changed at a time, at an equal training budget."""
 
 import csv
-import hashlib
 import os
 import platform
 from collections.abc import Sequence
@@ -14,7 +13,7 @@ import torch
 from rich.console import Console
 
 from experiments.ablations.networks import register_variants
-from experiments.trial import Trial
+from experiments.trial import Trial, fingerprint
 from stereoweave.bench.edge_metrics import edge_bad_percent, edge_epe_px, flying_percent
 from stereoweave.bench.projected_views import DisparityMethod
 from stereoweave.data.shards import Shards
@@ -121,11 +120,6 @@ def run_ablations(
         rows[i] = {key: _format_value(value) for key, value in _make_row(trial, trained, held_out).items()}
         _write_report(report, [rows[j] for j in sorted(rows)])
         console.print(f"{trial.recipe.name}: {len(rows)} of {len(planned)}")
-
-
-def fingerprint(recipe: Recipe) -> str:
-    """Return the hash of a recipe without its name, in 8 hexadecimal digits."""
-    return hashlib.sha256(repr(replace(recipe, name="")).encode()).hexdigest()[:8]
 
 
 def _make_row(trial: Trial, trained: Checkpoint, held_out: dict[str, PairSource]) -> dict[str, object]:

@@ -39,8 +39,8 @@ def paper(  # noqa: PLR0913 - each is an option of the command line
 ) -> None:
     """Train the paper's network, its rivals and all variants, and compare them with the paper's tables.
 
-    Rerun the same command to resume after an interruption. Trainings whose scores the report's folder holds
-    are not repeated: remove trainings.jsonl there after a change of the code.
+    Rerun the same command to resume after an interruption. Trainings that the report's folder holds are not
+    repeated: remove its trainings.jsonl and the runs after a change of the code.
     """
     from rich.console import Console
 

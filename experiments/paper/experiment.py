@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from rich.console import Console
 
-from experiments.paper.finished import finish
+from experiments.paper.finished import score_training
 from experiments.paper.trials import CLAIMS, SLOW_SHARE, Extent, list_trials
 from experiments.trial import Trial
 from stereoweave.errors import StereoweaveError
@@ -98,6 +98,6 @@ def _train(runs: Path, jobs: int, scored: bool, recipe: Recipe) -> str:
     torch.set_num_threads(max(1, torch.get_num_threads() // jobs))
     train_recipe(recipe, runs / recipe.name, Console(quiet=True))
     if scored:
-        finish(runs / recipe.name, runs / "pairs")
+        score_training(runs / recipe.name, runs / "pairs")
     count_step()
     return recipe.name

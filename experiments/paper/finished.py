@@ -1,17 +1,16 @@
-"""Finished trainings: their scores and curves, which are kept after their run folders are gone."""
+"""Scores and curves of finished trainings, which a report keeps after the folders of the runs are gone."""
 
 import json
-import platform
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
-import torch
-
+from experiments.trial import fingerprint
 from stereoweave.bench.projected_views import ProjectionRow
+from stereoweave.errors import FormatError
 from stereoweave.io.files import replacing
 from stereoweave.learn import checkpoint
+from stereoweave.learn.devices import choose_device, describe_device
 from stereoweave.learn.evaluation import score_run
 from stereoweave.learn.training.loop import SCORES_FILE, read_scores
 
@@ -19,73 +18,79 @@ _FILE = "finished.json"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Finished:
+class FinishedTraining:
     """What a report needs of a finished training, except for its weights.
 
     Attributes:
-        name: Name of its recipe, which spells out its settings.
+        name: Name of its recipe.
+        fingerprint: Hash of its recipe, by which a trial finds it.
         commit: Commit of the code that trained it.
-        machine: GPU or processor that finished it.
-        minutes: Wall time, including that of the run that it started from; runs may share the machine.
+        machine: GPU or processor on which it ended and was scored.
+        minutes: Wall time, including that of the run that it started from; None if unknown. Runs may share
+            the machine.
         validation: Scores of its last validation.
-        row: Scores on all held-out pairs.
+        scores: Scores on all held-out pairs.
         curve: Scores of every validation, with its step.
     """
 
     name: str
+    fingerprint: str
     commit: str
     machine: str
-    minutes: float
+    minutes: float | None
     validation: dict[str, float]
-    row: ProjectionRow
+    scores: ProjectionRow
     curve: list[dict[str, float]]
 
 
-def finish(run: Path, pairs: Path) -> Finished:
-    """Score a run that has made all its steps, and keep the result in its folder.
+def score_training(run: Path, pairs: Path) -> FinishedTraining:
+    """Score a run that has taken all its steps, and keep the result in its folder.
 
     Args:
         run: Folder of the run, named like its recipe.
         pairs: Cache folder of collage pairs.
     """
     trained = checkpoint.load(run / "last.pt")
-    found = Finished(
+    training = FinishedTraining(
         name=run.name,
+        fingerprint=fingerprint(trained.recipe),
         commit=trained.commit,
-        machine=_describe_device(),
+        machine=describe_device(choose_device()),
         minutes=60 * trained.hours,
         validation=trained.scores,
-        row=score_run(trained, run.name, pairs),
+        scores=score_run(trained, run.name, pairs),
         curve=read_scores(run / SCORES_FILE),
     )
-    _write_lines(run / _FILE, [found])
-    return found
+    keep_finished(run / _FILE, [training])
+    return training
 
 
-def find_finished(runs: Path, report: Path) -> dict[str, Finished]:
-    """Return the finished trainings in a report's file and in a folder of runs, by name; the latter win."""
+def find_finished(runs: Path, report: Path) -> dict[str, FinishedTraining]:
+    """Return the trainings in a report's file and in a folder of runs, by fingerprint; the latter win.
+
+    Raises:
+        FormatError: If a file is damaged.
+    """
     files = [report, *sorted(runs.glob(f"*/{_FILE}"))]
-    found = [one for file in files if file.exists() for one in _read_lines(file)]
-    return {one.name: one for one in found}
+    found = [training for file in files if file.exists() for training in _read(file)]
+    return {training.fingerprint: training for training in found}
 
 
-def keep_finished(report: Path, finished: Iterable[Finished]) -> None:
-    """Write trainings to a report's file, a line of JSON each, in the order of their names."""
-    _write_lines(report, sorted(finished, key=lambda one: one.name))
-
-
-def _write_lines(path: Path, finished: Iterable[Finished]) -> None:
-    lines = (json.dumps(asdict(one)) + "\n" for one in finished)
-    with replacing(path) as temporary:
+def keep_finished(file: Path, trainings: Iterable[FinishedTraining]) -> None:
+    """Write trainings to a file, a line of JSON each, in the order of their names."""
+    lines = (
+        json.dumps(asdict(training)) + "\n" for training in sorted(trainings, key=lambda each: each.name)
+    )
+    with replacing(file) as temporary:
         temporary.write_text("".join(lines), encoding="utf-8")
 
 
-def _read_lines(path: Path) -> list[Finished]:
-    lines: list[dict[str, Any]] = [json.loads(line) for line in path.read_text("utf-8").splitlines()]
-    return [Finished(**{**line, "row": ProjectionRow(**line["row"])}) for line in lines]
-
-
-def _describe_device() -> str:
-    if torch.cuda.is_available():
-        return torch.cuda.get_device_name()
-    return f"{platform.machine()} {torch.backends.cpu.get_cpu_capability()}"
+def _read(file: Path) -> list[FinishedTraining]:
+    try:
+        lines = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
+        return [FinishedTraining(**{**line, "scores": ProjectionRow(**line["scores"])}) for line in lines]
+    except (ValueError, TypeError, KeyError) as error:
+        raise FormatError(
+            f"{file}: expected finished trainings, found unexpected contents ({error}); remove the file to "
+            "train again"
+        ) from error

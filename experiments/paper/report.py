@@ -1,6 +1,7 @@
 """Report of the paper's experiment: rows as CSV, tables as Markdown, and the paper's figures."""
 
 import csv
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +17,7 @@ from experiments.paper.claims import (
     settings_table,
 )
 from experiments.paper.figures import draw_exponent_curves, draw_iterations, draw_validation, draw_views
-from experiments.paper.finished import Finished, find_finished, keep_finished
+from experiments.paper.finished import FinishedTraining, find_finished, keep_finished
 from experiments.paper.trials import (
     ADJUSTMENT,
     FITTED,
@@ -29,7 +30,7 @@ from experiments.paper.trials import (
     TRANSFER,
     TUNED,
 )
-from experiments.trial import Trial
+from experiments.trial import Trial, fingerprint
 from stereoweave.bench.projected_views import DisparityMethod, ProjectionRow
 from stereoweave.bench.tables import write_csv
 from stereoweave.errors import FormatError, StereoweaveError
@@ -59,7 +60,7 @@ class Report:
         trained: Trials that are fully trained.
         missing: Recipe names of the unfinished trials.
         runs: Folder of the runs, from which figures take the networks.
-        finished: Finished trainings, by recipe name; some may be none of the trials'.
+        finished: Finished trainings, by fingerprint; some may be none of the trials'.
         rows: One row per trained trial.
         common: Scores of untrained methods on the base's held-out pairs.
     """
@@ -71,7 +72,7 @@ class Report:
     trained: list[Trial]
     missing: list[str]
     runs: Path
-    finished: dict[str, Finished]
+    finished: dict[str, FinishedTraining]
     rows: list[PaperRow]
     common: list[ProjectionRow]
 
@@ -108,18 +109,27 @@ def write_report(base: Recipe, planned: Sequence[Trial], runs: Path, out: Path) 
 
 
 def list_unfinished(planned: Sequence[Trial], runs: Path, out: Path) -> list[Trial]:
-    """Return the trials that neither a run's folder nor the report's folder holds as finished."""
+    """Return the trials to train: those that neither the runs nor the report's folder holds as finished.
+
+    A finished trial is trained again if an unfinished one starts from it, and its checkpoint is gone.
+    """
     finished = find_finished(runs, out / FINISHED)
-    return [trial for trial in planned if trial.recipe.name not in finished]
+    missing = [trial for trial in planned if fingerprint(trial.recipe) not in finished]
+    starts = {
+        Path(trial.recipe.start_from).parent.name
+        for trial in missing
+        if trial.recipe.start_from and not Path(trial.recipe.start_from).exists()
+    }
+    return [trial for trial in planned if trial in missing or trial.recipe.name in starts]
 
 
 def _gather(base: Recipe, planned: Sequence[Trial], runs: Path, out: Path) -> Report:
-    names = {trial.recipe.name for trial in planned}
     finished = find_finished(runs, out / FINISHED)
-    trained = [trial for trial in planned if trial.recipe.name in finished]
+    trained = [trial for trial in planned if fingerprint(trial.recipe) in finished]
+    missing = {trial.recipe.name for trial in planned} - {trial.recipe.name for trial in trained}
     if not trained:
         raise StereoweaveError(
-            f"{runs}: expected at least one finished trial, found none of {len(names)}; "
+            f"{runs}: expected at least one finished trial, found none of {len(missing)}; "
             "run `python -m experiments.paper`"
         )
     training, held_out = open_sources(base, runs / "pairs", whole=True)
@@ -129,16 +139,16 @@ def _gather(base: Recipe, planned: Sequence[Trial], runs: Path, out: Path) -> Re
         held_out=held_out,
         planned=list(planned),
         trained=trained,
-        missing=sorted(names - finished.keys()),
+        missing=sorted(missing),
         runs=runs,
         finished=finished,
-        rows=[_make_row(trial, finished[trial.recipe.name]) for trial in trained],
+        rows=[_make_row(trial, finished[fingerprint(trial.recipe)]) for trial in trained],
         common=score_with_baselines(base, {}, runs / "pairs", Console(quiet=True)),
     )
 
 
-def _make_row(trial: Trial, finished: Finished) -> PaperRow:
-    recipe, score = trial.recipe, finished.row
+def _make_row(trial: Trial, finished: FinishedTraining) -> PaperRow:
+    recipe, score = trial.recipe, finished.scores
     return PaperRow(
         claim=trial.claim,
         setting=trial.setting,
@@ -159,7 +169,7 @@ def _make_row(trial: Trial, finished: Finished) -> PaperRow:
         mae_filled=score.mae_filled,
         psnr_db=score.psnr_db,
         ssim=score.ssim,
-        minutes=finished.minutes,
+        minutes=math.nan if finished.minutes is None else finished.minutes,
         commit=finished.commit,
         machine=finished.machine,
     )
@@ -273,7 +283,7 @@ def _format_common_table(rows: Sequence[ProjectionRow], depth: bool) -> str:
 def _describe_transfer(report: Report) -> str:
     """Describe how many steps the tuned network takes to reach the best loss of training from scratch."""
     curves = {
-        trial.setting: report.finished[trial.recipe.name].curve
+        trial.setting: report.finished[fingerprint(trial.recipe)].curve
         for trial in report.trained
         if trial.claim == TRANSFER
     }
@@ -326,7 +336,10 @@ def _curves_by_setting(report: Report, claim: str) -> dict[str, list[list[tuple[
     # Reversed, so that the first trial of a name is kept.
     once = {trial.recipe.name: trial for trial in reversed(report.trained) if trial.claim == claim}
     found: dict[str, list[list[tuple[int, float]]]] = {}
-    for name, trial in reversed(once.items()):
-        curve = [(int(point["step"]), point["squared_error"]) for point in report.finished[name].curve]
+    for trial in reversed(once.values()):
+        curve = [
+            (int(point["step"]), point["squared_error"])
+            for point in report.finished[fingerprint(trial.recipe)].curve
+        ]
         found.setdefault(trial.setting, []).append(curve)
     return found

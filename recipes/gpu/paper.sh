@@ -8,10 +8,16 @@ compare() {
         --slow-steps 1500 "$@"
 }
 
+started=()
 for name in propeller_worlds propeller_metres; do
     python3 -m stereoweave train "recipes/paper/$name.toml" -o "runs/$name" &
+    started+=($!)
 done
-compare --jobs 2 --only "networks, fewer steps" --report runs/fewer_steps &
-compare --jobs 4 --only "projection loss" --only networks --only "depth adjustment" --only iterations \
+compare --jobs 3 --only "networks, fewer steps" --report runs/fewer_steps &
+started+=($!)
+compare --jobs 6 --only "projection loss" --only networks --only "depth adjustment" --only iterations \
     --report runs/equal_steps &
-wait
+started+=($!)
+failed=0
+for id in "${started[@]}"; do wait "$id" || failed=1; done
+exit "$failed"

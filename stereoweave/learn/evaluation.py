@@ -20,6 +20,7 @@ from stereoweave.learn import checkpoint
 from stereoweave.learn.checkpoint import Checkpoint
 from stereoweave.learn.data.batches import collate, read_known
 from stereoweave.learn.data.sources import PairSource, cache_pairs, open_sources
+from stereoweave.learn.devices import choose_device
 from stereoweave.learn.mc_cnn_matcher import match_sample
 from stereoweave.learn.models import CodeNetwork, build_network
 from stereoweave.learn.models.mc_cnn import MCCNN
@@ -103,7 +104,7 @@ def make_method(trained: Checkpoint) -> DisparityMethod:
 
     The network runs on a GPU if there is one.
     """
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    device = choose_device()
     network = build_network(trained.recipe)
     network.load_state_dict(trained.averaged)
     network.eval().to(device)
@@ -112,7 +113,8 @@ def make_method(trained: Checkpoint) -> DisparityMethod:
 
     def match(sample: Sample) -> Float[np.ndarray, "h w"]:
         batch = {name: values.to(device) for name, values in collate([sample]).items()}
-        with torch.no_grad():
+        # In float32: by default, convolutions on a GPU round to TF32.
+        with torch.no_grad(), torch.backends.cudnn.flags(allow_tf32=False):
             output = network(batch["left"], batch["right"])
             if isinstance(network, CodeNetwork):
                 return objective.disparity_px(output, batch)[0, 0].cpu().numpy()

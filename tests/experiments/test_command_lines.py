@@ -168,27 +168,34 @@ def test_scores_by_world_are_written_and_printed_by_split(folder, monkeypatch, c
 
 
 @pytest.mark.parametrize(
-    ("options", "extent"),
+    ("options", "extent", "trained"),
     [
-        ("", Extent(seeds=2)),
+        ("", Extent(seeds=2), [["unfinished"]]),
         (
             "--slow-steps 7 --only loss --only decoder",
             Extent(seeds=2, slow_steps=7, claims=["loss", "decoder"]),
+            [["unfinished"]],
         ),
+        ("--finished", Extent(seeds=2), []),
     ],
-    ids=["all claims", "two claims"],
+    ids=["all claims", "two claims", "what is finished"],
 )
-def test_the_papers_experiment_is_planned_trained_and_reported(folder, monkeypatch, capfd, options, extent):
+def test_the_papers_experiment_is_planned_trained_and_reported(
+    folder, monkeypatch, capfd, options, extent, trained
+):
     from experiments.paper import experiment, report
 
     done = []
 
     def plan(base, runs, asked, console):
         done.append(("plan", base.name, runs, asked))
-        return ["trials"]
+        return ["finished", "unfinished"]
 
     monkeypatch.setattr(experiment, "plan", plan)
-    monkeypatch.setattr(experiment, "run_trials", lambda *given: done.append(("train", *given[:3])))
+    monkeypatch.setattr(
+        experiment, "run_trials", lambda *given, scored: done.append(("train", *given[:3], scored))
+    )
+    monkeypatch.setattr(report, "list_unfinished", lambda planned, runs, out: planned[1:])
     monkeypatch.setattr(
         report, "write_report", lambda base, *given: done.append(("report", base.name, *given))
     )
@@ -196,7 +203,7 @@ def test_the_papers_experiment_is_planned_trained_and_reported(folder, monkeypat
     runs, results = Path("runs"), Path("results")
     assert done == [
         ("plan", "experiment", runs, extent),
-        ("train", ["trials"], runs, 4),
-        ("report", "experiment", ["trials"], runs, results),
+        *(("train", trials, runs, 4, True) for trials in trained),
+        ("report", "experiment", ["finished", "unfinished"], runs, results),
     ]
     assert capfd.readouterr().out == "tables: results/paper.md\n"

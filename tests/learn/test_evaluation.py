@@ -24,7 +24,7 @@ from stereoweave.learn import checkpoint
 from stereoweave.learn.data.batches import collate
 from stereoweave.learn.data.pair_cache import CachedPairs
 from stereoweave.learn.data.sources import VALIDATION_SEED
-from stereoweave.learn.evaluation import evaluate, make_median_method, make_method
+from stereoweave.learn.evaluation import evaluate, make_median_method, make_method, score_run
 from stereoweave.learn.mc_cnn_matcher import describe
 from stereoweave.learn.models import build_network
 
@@ -89,6 +89,12 @@ def test_a_checkpoint_gets_the_scores_of_its_run_folder(folder, rows):
     (folder / "kept.pt").write_bytes((folder / "random" / "last.pt").read_bytes())
     *_, row = evaluate([folder / "kept.pt"], folder / "pairs", QUIET)
     assert row == replace(rows["random"], method="kept", epe_cm=row.epe_cm)
+
+
+def test_a_run_scored_alone_has_the_row_that_it_has_beside_the_baselines(folder, rows):
+    alone = score_run(KEPT["random"], "random", folder / "pairs")
+    # Of collages, which have no camera, the error in cm is NaN.
+    assert replace(alone, epe_cm=0.0) == replace(rows["random"], epe_cm=0.0)
 
 
 def test_a_constant_disparity_has_the_expected_error(rows):

@@ -20,7 +20,8 @@ from stereoweave.system.progress import progress
 
 # Seed of validation pairs; the seeds of recipes are small.
 VALIDATION_SEED = 1_000_003
-# Memory in which training keeps decoded pairs: all 2,250 of a set by world at 320x240, a few of Sintel.
+# Memory in which training keeps decoded pairs: all 2,250 of a set by world at 320x240, a few of Sintel. The
+# pairs that it validates on have as much of their own.
 _KEPT_BYTES = 4 * 2**30
 
 

@@ -1,17 +1,16 @@
 """Learning curves: validation scores against the number of pairs seen, with fitted power laws."""
 
 import csv
-import platform
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.files import replacing
 from stereoweave.learn import checkpoint
+from stereoweave.learn.devices import choose_device, describe_device
 from stereoweave.learn.training.loop import SCORES_FILE, read_scores
 
 # The first scores show how a run recovers from its initial weights, not how it learns.
@@ -51,7 +50,7 @@ def record_curve(run: Path, out: Path) -> dict[str, PowerLaw]:
             f"{run / SCORES_FILE}: expected scores of a run, found none; train until the first validation"
         )
     recipe = kept.recipe
-    machine = f"{platform.machine()} {torch.backends.cpu.get_cpu_capability()}"
+    machine = describe_device(choose_device())
     rows = [
         {
             "recipe": run.name,

@@ -48,11 +48,11 @@ class Objective(Protocol):
     """A training loss and the validation scores that go with it.
 
     Attributes:
-        same_work: Whether prediction and losses do the same work on the GPU for every batch of the same
-            shapes, without waiting for it, so that a graph can record it.
+        recordable: Whether a CUDA graph can record prediction and losses: they run the same operations for
+            every batch, and never wait for the GPU.
     """
 
-    same_work: bool
+    recordable: bool
 
     def check(self, batch: Batch) -> None:
         """Raise StereoweaveError if the batch's ground truth cannot be trained on."""
@@ -106,7 +106,7 @@ class WeaveObjective:
     an exponent of 1, it compares disparities in pixels.
     """
 
-    same_work = True
+    recordable = False  # only rendered pairs have cameras, so the batches of a mix differ
 
     def __init__(self, recipe: Recipe) -> None:
         self.recipe = recipe
@@ -147,7 +147,7 @@ class CodeObjective:
     DispNet's) own loss up to the factor 1 / d_max, to which Adam is invariant.
     """
 
-    same_work = True
+    recordable = True
 
     def __init__(self, recipe: Recipe, network: CodeNetwork) -> None:
         self.recipe, self.curve = recipe, build_curve(recipe)
@@ -155,20 +155,18 @@ class CodeObjective:
         self.compare = _choose_comparison(recipe)
 
     def check(self, batch: Batch) -> None:
-        self.curve.encode(compute_target(self.recipe, batch))
+        self.curve.check(compute_target(self.recipe, batch))
 
     def predict(self, network: CodeNetwork, batch: Batch) -> tuple[Map, ...]:
         return network.outputs(batch["left"], batch["right"])
 
     def losses(self, predicted: tuple[Map, ...], batch: Batch) -> dict[str, Tensor]:
+        # Unchecked, because a check waits for the GPU; `check` has seen the batch.
         truth = self.curve.encode_estimate(compute_target(self.recipe, batch))
         terms = [self._terms(output.float(), truth, batch) for output in predicted]
-        return {
-            name: torch.stack(
-                [weight * term[name] for weight, term in zip(self.output_weights, terms, strict=True)]
-            ).sum()
-            for name in terms[0]
-        }
+        weighted = list(zip(self.output_weights, terms, strict=True))
+        # No tensor of weights: a CUDA graph cannot record its copy to the GPU.
+        return {name: torch.stack([w * term[name] for w, term in weighted]).sum() for name in terms[0]}
 
     def code(self, output: Map, batch: Batch) -> Map:
         """Convert a network's output to a code."""

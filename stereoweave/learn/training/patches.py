@@ -33,7 +33,7 @@ PATCHES = 32
 class PatchObjective:
     """Objective of MC-CNN: true matches are more similar than false ones on the same row."""
 
-    same_work = False  # the number of patches depends on the batch
+    recordable = False  # the number of patches depends on the batch
 
     def __init__(self, recipe: Recipe) -> None:
         self.recipe = recipe

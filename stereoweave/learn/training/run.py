@@ -42,9 +42,9 @@ class TrainingRun(ModelState):
         if self.fabric.world_size > 1 and self.fabric.device.type == "cuda":
             nn.SyncBatchNorm.convert_sync_batchnorm(self.network)  # type: ignore[no-untyped-call]
         torch.set_rng_state(start.random_state)
-        self.terms: tuple[str, ...] = ()
-        graphed = self.objective.same_work and fabric.device.type == "cuda"
-        self.compute = StepGraph(self._compute) if graphed else self._compute
+        # With several ranks, graphs have never been tried.
+        recorded = self.objective.recordable and fabric.device.type == "cuda" and fabric.world_size == 1
+        self.compute = StepGraph(self._compute) if recorded else self._compute
         self.began_s = self.saved_s = time.monotonic()
         self.scores = start.scores
         self.skipped: list[int] = []
@@ -59,6 +59,8 @@ class TrainingRun(ModelState):
         """
         for group in self.optimiser.param_groups:
             group["lr"] = self.recipe.learning_rate_at(step)
+        with name_in_errors(f"step {step}: one of {', '.join(batches.names(step))}"):
+            self.objective.check(batch)
         self.network.train()
         sums = StepSums(self.network)
         terms = self._gradient(step, self.fabric.to_device(batch), batches, sums)
@@ -81,28 +83,24 @@ class TrainingRun(ModelState):
         self, step: int, batch: dict[str, torch.Tensor], batches: Batches, sums: StepSums
     ) -> dict[str, float]:
         """Compute the gradient of a step over all ranks. Returns the loss and its terms."""
-        what = f"step {step}: one of {', '.join(batches.names(step))}"
         for part, values in zip(batches.parts, split_batch(batch, len(batches.parts)), strict=True):
             if self.recipe.micro_batches > 1:
                 # Seeded per micro-batch, so that dropout does not depend on the number of ranks.
                 torch.manual_seed(int(np.random.SeedSequence(batches.key(step, part)).generate_state(1)[0]))
-            with name_in_errors(what):
-                self.objective.check(values)
-                losses = self.compute(values)
-            sums.add(losses)
+            losses = self.compute(values)
+            sums.add([*losses.values()])
         means = sums.finish(self.fabric, self.recipe.micro_batches)
-        return dict(zip(["loss", *self.terms], means, strict=True))
+        return dict(zip(losses, means, strict=True))
 
-    def _compute(self, batch: dict[str, torch.Tensor]) -> list[torch.Tensor]:
-        """Compute the gradient of a micro-batch. Returns its loss, and the loss's terms."""
+    def _compute(self, batch: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        """Compute the gradient of a micro-batch. Returns its loss and the loss's terms."""
         with self.fabric.autocast():
             predicted = self.objective.predict(self.network, batch)
         terms = self.objective.losses(predicted, batch)
         loss = torch.stack(list(terms.values())).sum()
         self.optimiser.zero_grad()
         self.fabric.backward(loss)
-        self.terms = tuple(terms)
-        return [loss.detach(), *(term.detach() for term in terms.values())]
+        return {"loss": loss.detach(), **{name: term.detach() for name, term in terms.items()}}
 
     def _skip(self, step: int, found: str, batches: Batches) -> None:
         found = f"step {step}: {found}; the pairs are {', '.join(batches.names(step))}"

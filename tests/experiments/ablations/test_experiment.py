@@ -10,8 +10,9 @@ from rich.console import Console
 
 from experiments.ablations import experiment as ablations
 from experiments.ablations.__main__ import main
-from experiments.ablations.experiment import BASE, VARIATIONS, fingerprint, plan, run_ablations
+from experiments.ablations.experiment import BASE, VARIATIONS, plan, run_ablations
 from experiments.ablations.networks import register_variants
+from experiments.trial import fingerprint
 from stereoweave.data.packing import pack
 from stereoweave.data.shards import write_shard
 from stereoweave.learn import checkpoint

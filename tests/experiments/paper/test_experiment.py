@@ -22,7 +22,7 @@ from experiments.paper import experiment as paper
 from experiments.paper import report as paper_report
 from experiments.paper import trials as the_trials
 from experiments.paper.experiment import plan, run_trials
-from experiments.paper.finished import Finished
+from experiments.paper.finished import FinishedTraining, find_finished, keep_finished
 from experiments.paper.report import FINISHED, Report, list_unfinished, write_report
 from experiments.paper.trials import (
     ADJUSTMENT,
@@ -35,7 +35,7 @@ from experiments.paper.trials import (
     Extent,
     list_trials,
 )
-from experiments.trial import Trial
+from experiments.trial import Trial, fingerprint
 from stereoweave.bench.projected_views import ProjectionRow
 from stereoweave.data.paper_layout import write_frame
 from stereoweave.io.images import read_image
@@ -291,7 +291,7 @@ def test_a_resumed_experiment_trains_only_what_is_missing(experiment, in_place, 
 def test_a_training_whose_run_is_gone_is_reported_again_and_not_repeated(experiment, tmp_path):
     out, runs = tmp_path / "report", tmp_path / "runs"
     shutil.copytree(experiment.out, out)
-    (runs / "pairs").parent.mkdir()
+    runs.mkdir()
     shutil.copytree(experiment.runs / "pairs", runs / "pairs")
     missing = [trial for trial in experiment.planned if trial.recipe.name not in TRAINED]
     assert list_unfinished(experiment.planned, runs, out) == missing
@@ -299,6 +299,41 @@ def test_a_training_whose_run_is_gone_is_reported_again_and_not_repeated(experim
     write_report(BASE, experiment.planned, runs, out)
     for name in ("paper.csv", "paper.md", FINISHED, "views.jpg", "iterations.jpg"):
         assert (out / name).read_bytes() == before[name], name
+
+
+def test_a_training_with_another_setting_is_not_taken_for_a_finished_one(experiment):
+    slower = [
+        replace(trial, recipe=replace(trial.recipe, learning_rate=1e-5)) for trial in experiment.of(FIRST)
+    ]
+    assert list_unfinished(experiment.of(FIRST), experiment.runs, experiment.out) == []
+    assert list_unfinished(slower, experiment.runs, experiment.out) == slower
+
+
+def test_a_training_is_repeated_if_another_starts_from_its_lost_checkpoint(experiment, tmp_path):
+    first, tuned = experiment.of(FIRST)[0], experiment.of(WITHOUT)[0]
+    there, gone = experiment.last(FIRST), tmp_path / FIRST / "last.pt"
+    for start, expected in ((there, 1), (gone, 2)):
+        recipe = replace(tuned.recipe, start_from=str(start), name="tuned")
+        found = list_unfinished([first, replace(tuned, recipe=recipe)], experiment.runs, experiment.out)
+        assert [trial.recipe.name for trial in found] == [FIRST, "tuned"][-expected:]
+
+
+def test_of_a_training_in_the_report_and_in_its_run_the_run_wins(tmp_path):
+    report, run = tmp_path / "trainings.jsonl", tmp_path / "runs" / "tiny"
+    run.mkdir(parents=True)
+    other = replace(finished_of("other", []), fingerprint="01234567")
+    old, new = finished_of("tiny", []), replace(finished_of("tiny", []), minutes=None)
+    keep_finished(report, [old, other])
+    keep_finished(run / "finished.json", [new])
+    assert find_finished(tmp_path / "runs", report) == {"89abcdef": new, "01234567": other}
+
+
+def test_a_damaged_file_of_finished_trainings_is_named(tmp_path):
+    report = tmp_path / "trainings.jsonl"
+    for damage in ("{", '{"name": "tiny"}', "[]", '{"scores": {"epe_px": 1}}'):
+        report.write_text(damage)
+        message = complaint(find_finished, tmp_path, report)
+        assert message.startswith(f"{report}: expected finished trainings, found unexpected contents (")
 
 
 def test_what_starts_from_another_training_comes_after_it(monkeypatch, tmp_path):
@@ -323,13 +358,14 @@ def test_a_tuned_trial_starts_from_a_run_below_the_folder_of_the_runs():
 def finished_of(name, curve):
     """Return a training whose scores are all 0: only its curve is read."""
     scores = {field.name: 0.0 for field in fields(ProjectionRow)} | {"method": name}
-    return Finished(
+    return FinishedTraining(
         name=name,
+        fingerprint="89abcdef",
         commit="0123abc",
         machine="",
         minutes=0.0,
         validation={},
-        row=ProjectionRow(**scores),
+        scores=ProjectionRow(**scores),
         curve=curve,
     )
 
@@ -343,7 +379,10 @@ def report_of(trained, curves):
         trained=trained,
         missing=[],
         runs=Path("runs"),
-        finished={name: finished_of(name, curve) for name, curve in curves.items()},
+        finished={
+            fingerprint(trial.recipe): finished_of(trial.recipe.name, curves[trial.recipe.name])
+            for trial in trained
+        },
         rows=[],
         common=[],
     )

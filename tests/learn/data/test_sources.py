@@ -139,6 +139,11 @@ def test_validation_pairs_are_spread_over_the_held_out_frames(recipe, tmp_path, 
     assert names(held_out) == [FRAMES[number] for number in chosen]
 
 
+def test_frames_of_validations_are_decoded_once(recipe, tmp_path):
+    _, held_out = open_sources(replace(recipe, validation_pairs=2), tmp_path)
+    assert held_out[1] is held_out[1]
+
+
 def test_all_held_out_frames_are_returned_on_request(recipe, tmp_path):
     _, held_out = open_sources(replace(recipe, validation_pairs=1), tmp_path, whole=True)
     assert names(held_out) == FRAMES[36:]
