@@ -40,6 +40,13 @@ def soft_argmax(logits: Float[Tensor, "b d h w"]) -> Float[Tensor, "b 1 h w"]:
     return (logits.softmax(1) * levels).sum(1, keepdim=True)
 
 
+class NoWeights(nn.Module):
+    """Placeholder for the upsampling weights that returns one map of zeros."""
+
+    def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b 1 h w"]:
+        return torch.zeros_like(x[:, :1])
+
+
 class BilinearWeaveNet(WeaveNet):
     """WeaveNet with bilinear upsampling instead of weights from the image."""
 
@@ -47,9 +54,8 @@ class BilinearWeaveNet(WeaveNet):
 
     def __init__(self) -> None:
         super().__init__()
-        # The weights would be computed but never used.
-        self.register_module("weights", nn.Identity())
-        self.refinement.register_module("weights", nn.Identity())
+        self.register_module("weights", NoWeights())
+        self.refinement.register_module("weights", NoWeights())
 
 
 class AllLevelsWeaveNet(WeaveNet):

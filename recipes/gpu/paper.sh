@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# The paper's trainings on videos of few propellers, side by side on one GPU; resumes (recipes/gpu/README.md).
+# Renders videos of few propellers, then trains the paper's networks on them, side by side on one GPU; resumes (recipes/gpu/README.md).
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 export OMP_NUM_THREADS=1
@@ -7,6 +7,9 @@ compare() {
     python3 -m experiments.paper recipes/paper/propeller_networks.toml -o runs/propeller_networks \
         --slow-steps 1500 "$@"
 }
+
+python3 -m stereoweave synth make propeller --worlds 5 --frames 625 --seed 4 --size 320x240 --rig 264 0.25 \
+    --distance 2.8 3.6 --layout paper --jobs "$(nproc)" -o runs/worlds/propeller
 
 started=()
 for name in propeller_worlds propeller_metres; do

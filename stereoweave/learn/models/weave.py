@@ -126,6 +126,8 @@ class WeaveStages:
             [2B, 1, H/2, W/2].
         disparity_px: Final disparity [2B, 1, H, W].
         confidence_logit: Log odds that the disparity is within 1 px of the truth [2B, 1, H, W].
+        coarse_logits: Logits of the weights that upsample the disparity to 1/2 resolution [2B, K, H/4, W/4].
+        fine_logits: Logits of the weights that upsample it to full resolution [2B, K, H/2, W/2].
     """
 
     correlation: Float[Tensor, "b d h_d w_d"]
@@ -133,6 +135,8 @@ class WeaveStages:
     coarse_px: Float[Tensor, "b 1 h2 w2"]
     disparity_px: Float[Tensor, "b 1 h w"]
     confidence_logit: Float[Tensor, "b 1 h w"]
+    coarse_logits: Float[Tensor, "b kc h4 w4"]
+    fine_logits: Float[Tensor, "b kf h2 w2"]
 
 
 class WeaveFeatures(NamedTuple):
@@ -321,9 +325,10 @@ class WeaveNet(nn.Module):
         correlation, scores, decoded = self.match(maps, first)
         quarter = self.read_disparity(scores.float(), decoded)
         spread, decoded = self._propagate(quarter, first.quarter, decoded, batch)
-        coarse = self.upsample(spread * 2, self.weights(decoded).float())
+        coarse_logits = self.weights(decoded).float()
+        coarse = self.upsample(spread * 2, coarse_logits)
         match_half = self.to_match_half(maps.half)
-        fine, weights, confidence = self.refinement(
+        fine, fine_logits, confidence = self.refinement(
             coarse,
             as_left_view(match_half, batch),
             as_other_view(match_half, batch),
@@ -334,8 +339,10 @@ class WeaveNet(nn.Module):
             correlation=correlation,
             scores=scores,
             coarse_px=coarse * 2,
-            disparity_px=self.upsample(fine * 2, weights.float()),
+            disparity_px=self.upsample(fine * 2, fine_logits.float()),
             confidence_logit=confidence.float(),
+            coarse_logits=coarse_logits,
+            fine_logits=fine_logits.float(),
         )
 
     def match(self, maps: WeaveFeatures, first: WeaveFeatures) -> tuple[Tensor, Tensor, Tensor]:

@@ -17,6 +17,8 @@ from stereoweave.learn.models.weave import WeaveStages
 from stereoweave.learn.training.warp import reconstruct_left
 
 _ROBUST_SCALE = 2.5
+# Upsampling logits beyond this magnitude change no pixel's share noticeably: sigmoid(8) is 0.9997.
+_LARGEST_LOGIT = 8.0
 
 
 def weave_losses(
@@ -55,6 +57,7 @@ def weave_losses(
         "coarse": 0.5 * compare(stages.coarse_px, halve(ahead_px)),
         "disparity": compare(stages.disparity_px, ahead_px),
         "confidence": 0.3 * confidence_loss(stages.confidence_logit, stages.disparity_px, truth_px),
+        "logits": 0.02 * (excess_loss(stages.coarse_logits) + excess_loss(stages.fine_logits)),
     }
 
 
@@ -96,6 +99,14 @@ def confidence_loss(
     within = (disparity_px.detach() - truth_px).abs() <= 1
     loss = F.binary_cross_entropy_with_logits(logit, within.float(), reduction="none")
     return masked_mean(loss, truth_px.isfinite())
+
+
+def excess_loss(logits: Float[Tensor, "b k h w"]) -> Float[Tensor, ""]:
+    """Return the mean excess of the logits' magnitude over 8.
+
+    Without this loss the logits grow to thousands, and amplify rounding errors at depth edges.
+    """
+    return (logits.abs() - _LARGEST_LOGIT).clamp(min=0).mean()
 
 
 def halve(truth_px: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b 1 h2 w2"]:

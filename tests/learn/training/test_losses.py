@@ -22,7 +22,7 @@ def a_map(*values):
     return torch.tensor(values, dtype=torch.float32).view(1, 1, 1, -1).requires_grad_()
 
 
-def stages(height=8, width=16):
+def stages(height=8, width=16, logit=0.0):
     """Return an uninformed prediction: equal levels, 5 px everywhere, a confidence of one half."""
     maps = {
         "correlation": torch.zeros(2, LEVELS, height // 4, width // 4),
@@ -30,6 +30,8 @@ def stages(height=8, width=16):
         "coarse_px": torch.full((2, 1, height // 2, width // 2), 5.0),
         "disparity_px": torch.full((2, 1, height, width), 5.0),
         "confidence_logit": torch.zeros(2, 1, height, width),
+        "coarse_logits": torch.full((2, 36, height // 4, width // 4), logit),
+        "fine_logits": torch.full((2, 36, height // 2, width // 2), logit),
     }
     return WeaveStages(**{name: values.requires_grad_() for name, values in maps.items()})
 
@@ -98,12 +100,25 @@ def test_the_terms_of_an_uninformed_prediction():
         "coarse": 0.5 * 2.75,
         "disparity": 2.75,
         "confidence": 0.3 * math.log(2),
+        "logits": 0,
     }
     assert {name: term.item() for name, term in terms.items()} == pytest.approx(expected, abs=1e-5)
 
 
-def test_unknown_truth_gives_no_nan_gradient_and_does_not_count():
+def test_upsampling_logits_beyond_8_cost_their_mean_excess():
     predicted = stages()
+    with torch.no_grad():
+        predicted.coarse_logits[:, :18], predicted.coarse_logits[:, 18:] = -28.0, 7.9
+        predicted.fine_logits[:, 0] = 80.0
+    term = weave_losses(predicted, *flat_truth(5.0))["logits"]
+    assert term.item() == pytest.approx(0.02 * (20 / 2 + 72 / 36))
+    term.backward()
+    assert predicted.coarse_logits.grad[:, :18].lt(0).all()
+    assert not predicted.coarse_logits.grad[:, 18:].any()
+
+
+def test_unknown_truth_gives_no_nan_gradient_and_does_not_count():
+    predicted = stages(logit=9.0)
     truth_px, occluded = flat_truth(4.0)
     truth_px[:, :, 2:7, 3:11] = NAN
     terms = weave_losses(predicted, truth_px, occluded)

@@ -21,6 +21,8 @@ def prediction(estimate_px=5.0, level_px=4, height=16, width=32):
         "coarse_px": torch.full((2, 1, height // 2, width // 2), estimate_px),
         "disparity_px": torch.full((2, 1, height, width), estimate_px),
         "confidence_logit": torch.zeros(2, 1, height, width),
+        "coarse_logits": torch.full((2, 36, height // level_px, width // level_px), 9.0),
+        "fine_logits": torch.full((2, 36, height // 2, width // 2), 9.0),
     }
     return WeaveStages(**{name: values.requires_grad_() for name, values in maps.items()})
 
@@ -47,7 +49,7 @@ def test_a_recipe_that_says_nothing_has_the_loss_as_it_was_to_the_last_bit():
     found = build_objective(RECIPE, network).losses(predicted, batch)
     assert found == weave_losses(predicted, batch["disparity_px"], batch["occluded"])
     assert found["disparity"] == regression_loss(predicted.disparity_px, batch["disparity_px"])
-    assert list(found) == ["correlation", "scores", "coarse", "disparity", "confidence"]
+    assert list(found) == ["correlation", "scores", "coarse", "disparity", "confidence", "logits"]
 
 
 @pytest.mark.parametrize("weight", [0.0, 0.5])
