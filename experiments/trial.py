@@ -1,7 +1,7 @@
 """Description of one training run of an experiment, and the hash of its recipe."""
 
 import hashlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 from stereoweave.learn.recipe import Recipe
@@ -23,6 +23,15 @@ class Trial:
 
 
 def fingerprint(recipe: Recipe) -> str:
-    """Return the hash of a recipe without its name and the place of the runs, in 8 hexadecimal digits."""
+    """Return the hash of a recipe without its name and the place of the runs, in 8 hexadecimal digits.
+
+    Settings at their defaults do not count, so that a recipe keeps its hash when recipes get new settings.
+    """
     start_from = "/".join(Path(recipe.start_from).parts[-2:])
-    return hashlib.sha256(repr(replace(recipe, name="", start_from=start_from)).encode()).hexdigest()[:8]
+    changed = {
+        field.name: value
+        for field in fields(recipe)
+        if (value := getattr(recipe, field.name)) != field.default
+    }
+    settings = changed | {"name": "", "start_from": start_from}
+    return hashlib.sha256(repr(sorted(settings.items())).encode()).hexdigest()[:8]
