@@ -290,14 +290,29 @@ def parity(
 def training(
     run: Annotated[Path, typer.Argument(help="Run folder of stereoweave train.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="CSV file to write; rows of other runs are kept.")],
+    recipe: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="RECIPE",
+            help="Recipe on whose held-out pairs and sets a run of recipes/gpu/train.py is scored first.",
+        ),
+    ] = None,
 ) -> None:
     """Record a run's learning curve, and fit power laws to it.
 
-    The curve shows held-out scores against the number of pairs seen.
+    The curve shows held-out scores against the number of pairs seen. A run that was trained for a
+    fixed time has one row for each state that was recorded, and no fit.
     """
     make_parent_folder(out)
+    from rich.console import Console
+
     with require_train_extra():
-        from stereoweave.learn.training.curves import record_curve
+        from stereoweave.learn.recipe import read_recipe
+        from stereoweave.learn.training.curves import record_curve, record_timed_run
+    if recipe is not None:
+        for name, score in record_timed_run(run, read_recipe(recipe), out, Console()).items():
+            typer.echo(f"{name}: {score:.5g}")
+        return
     for name, law in record_curve(run, out).items():
         typer.echo(f"{name}: {law.at_10000_pairs:.4g} * (pairs / 10,000)^-{law.exponent:.3f}")
 

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from stereoweave.data.packing import pack
+from stereoweave.data.shards import write_shard
 from stereoweave.errors import StereoweaveError
 from stereoweave.learn.checkpoint import Checkpoint
 from stereoweave.learn.data.batches import collate
@@ -125,6 +127,14 @@ def complaint(call, *arguments) -> str:
         call(*arguments)
     assert "\n" not in str(caught.value)
     return str(caught.value)
+
+
+def write_box_set(folder):
+    """Write a rendered set of one pair, a box before a wall. Returns its folder."""
+    folder.mkdir()
+    sample = replace(box_before_a_wall(np.random.default_rng(0)), camera=CAMERA)
+    write_shard(folder, "boxes", 0, [pack(sample, {})])
+    return folder
 
 
 @dataclass(frozen=True)

@@ -6,12 +6,18 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from rich.console import Console
 
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.files import replacing
 from stereoweave.learn import checkpoint
+from stereoweave.learn.data.sources import cache_pairs, open_held_out_sets, open_sources
 from stereoweave.learn.devices import choose_device, describe_device
+from stereoweave.learn.models import build_network
+from stereoweave.learn.recipe import Recipe
 from stereoweave.learn.training.loop import SCORES_FILE, read_scores
+from stereoweave.learn.training.scores import validate, validate_sets
+from stereoweave.learn.training.timed_run import NETWORK_FILE, PROGRESS_FILE, read_progress
 
 # The first scores show how a run recovers from its initial weights, not how it learns.
 _LEAST_PAIRS_SHARE = 0.1
@@ -49,21 +55,48 @@ def record_curve(run: Path, out: Path) -> dict[str, PowerLaw]:
         raise StereoweaveError(
             f"{run / SCORES_FILE}: expected scores of a run, found none; train until the first validation"
         )
-    recipe = kept.recipe
-    machine = describe_device(choose_device())
     rows = [
-        {
-            "recipe": run.name,
-            "pairs": round(scores["step"] * recipe.batch),
-            **{name: round(value, 5) for name, value in scores.items()},
-            "step": round(scores["step"]),
-            "commit": kept.commit,
-            "machine": machine,
-        }
-        for scores in record
+        _make_row(run, round(scores["step"] * kept.recipe.batch), scores, kept.commit) for scores in record
     ]
     _write(out, [*(row for row in _read(out) if row["recipe"] != run.name), *rows])
     return _fit_curves(rows)
+
+
+def record_timed_run(run: Path, recipe: Recipe, out: Path, console: Console) -> dict[str, float]:
+    """Score a timed run on a recipe's held-out pairs, and write the row to a CSV file. Returns the scores.
+
+    All other rows of the file are kept and come first.
+
+    Args:
+        run: Folder with the network and the progress of a timed run.
+        recipe: Recipe of the held-out pairs and sets.
+        out: CSV file to write, with the columns of `record_curve`.
+        console: Console for the progress of missing held-out collages.
+    """
+    kept, progress = checkpoint.load(run / NETWORK_FILE), read_progress(run / PROGRESS_FILE)
+    _, held_out = open_sources(recipe, run.parent / "pairs")
+    sets, device = open_held_out_sets(recipe), choose_device()
+    cache_pairs(held_out, console)
+    network = build_network(kept.recipe)
+    network.load_state_dict(kept.averaged)
+    network.to(device).eval()
+    scores = {"step": float(progress.steps)} | validate(network, held_out, device)
+    scores |= validate_sets(network, sets, device)
+    row = _make_row(run, progress.pairs, scores, kept.commit)
+    others = [one for one in _read(out) if (one["recipe"], one["step"]) != (run.name, str(progress.steps))]
+    _write(out, [*others, row])
+    return scores
+
+
+def _make_row(run: Path, pairs: int, scores: dict[str, float], commit: str) -> dict[str, Any]:
+    return {
+        "recipe": run.name,
+        "pairs": pairs,
+        **{name: round(value, 5) for name, value in scores.items()},
+        "step": round(scores["step"]),
+        "commit": commit,
+        "machine": describe_device(choose_device()),
+    }
 
 
 def _fit_curves(rows: Sequence[dict[str, Any]]) -> dict[str, PowerLaw]:

@@ -24,7 +24,7 @@ from stereoweave.learn.recipe import COLLAGE, Recipe, read_recipe
 from stereoweave.learn.training.fabric import keep_freed_memory, make_fabric, skip_teardown_on_error
 from stereoweave.learn.training.objective import build_objective, fit_recipe
 from stereoweave.learn.training.run import TrainingRun, load_start
-from stereoweave.learn.training.scores import validate_by_class
+from stereoweave.learn.training.scores import validate_sets
 from stereoweave.system.progress import progress
 
 # Scores of every validation, in the run's folder.
@@ -107,9 +107,7 @@ def _validate(run: TrainingRun, steps: int, held_out: PairSource, last: Path, co
     """Score the run after `steps` steps, and save its checkpoint and scores."""
     network, device = run.averaged.module, run.fabric.device
     scores = run.objective.scores(network, held_out, device)
-    for name, pairs in run.by_class.items():
-        found = validate_by_class(network, pairs, device)
-        scores |= {f"{name}_{key}": value for key, value in found.items()}
+    scores |= validate_sets(network, run.by_class, device)
     # Scores are saved before the checkpoint: a run killed in between writes the same row again.
     append_scores(last.with_name(SCORES_FILE), steps, scores)
     run.save(steps, scores, last)

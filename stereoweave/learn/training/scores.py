@@ -1,6 +1,6 @@
 """Validation scores of a network on held-out pairs."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 import torch
@@ -43,6 +43,17 @@ def validate_by_class(network: nn.Module, pairs: PairSource, device: torch.devic
         bad1_percent = {f"{name}_bad1_percent": classes[name].bad1_percent for name in CLASSES}
         rows.append(_compute_errors(estimate_px, truth_px) | bad1_percent)
     return _average(rows)
+
+
+def validate_sets(
+    network: nn.Module, sets: Mapping[str, PairSource], device: torch.device
+) -> dict[str, float]:
+    """Return the scores of `validate_by_class` on each set, each named SET_SCORE."""
+    return {
+        f"{name}_{score}": value
+        for name, pairs in sets.items()
+        for score, value in validate_by_class(network, pairs, device).items()
+    }
 
 
 def _predict(

@@ -67,7 +67,7 @@ def find_resume_point(recipe: Recipe, out: Path, earlier: Path | None, commit: s
             "command's files"
         )
     folders = [folder for folder in (out, earlier) if folder and (folder / PROGRESS_FILE).exists()]
-    found = [(_read_progress(folder / PROGRESS_FILE), folder) for folder in folders]
+    found = [(read_progress(folder / PROGRESS_FILE), folder) for folder in folders]
     if not found:
         return ResumePoint(
             checkpoint=checkpoint.make_initial(recipe, commit), optimiser={}, progress=RunProgress()
@@ -86,7 +86,8 @@ def find_resume_point(recipe: Recipe, out: Path, earlier: Path | None, commit: s
     return ResumePoint(checkpoint=state, optimiser=optimiser, progress=progress)
 
 
-def _read_progress(path: Path) -> RunProgress:
+def read_progress(path: Path) -> RunProgress:
+    """Read the progress of a timed run. Raises FormatError if the file's contents are others."""
     try:
         return RunProgress(**json.loads(path.read_text(encoding="utf-8")))
     except (ValueError, TypeError) as error:

@@ -1,12 +1,20 @@
 import csv
+import json
+from dataclasses import asdict, replace
 
 import pytest
-from learn_examples import RECIPE, checkpoint_of, complaint, untrained
+import torch
+from learn_examples import RECIPE, checkpoint_of, complaint, untrained, write_box_set
+from rich.console import Console
 
 from stereoweave.cli.root import main
 from stereoweave.learn import checkpoint
-from stereoweave.learn.training.curves import fit_power_law, record_curve
+from stereoweave.learn.data.pair_cache import CachedPairs
+from stereoweave.learn.data.sources import VALIDATION_SEED
+from stereoweave.learn.training.curves import fit_power_law, record_curve, record_timed_run
 from stereoweave.learn.training.loop import SCORES_FILE, append_scores
+from stereoweave.learn.training.scores import validate
+from stereoweave.learn.training.timed_run import NETWORK_FILE, PROGRESS_FILE, RunProgress
 
 
 @pytest.fixture
@@ -59,3 +67,32 @@ def test_a_run_without_scores_is_named(tmp_path):
 def test_the_command_prints_the_fits(run, tmp_path, capsys):
     assert main(["bench", "training", str(run), "-o", str(tmp_path / "curve.csv")]) == 0
     assert "bad1_percent: 20 * (pairs / 10,000)^-0.250" in capsys.readouterr().out
+
+
+@pytest.fixture
+def timed_run(tmp_path):
+    """Write a timed run of 7 steps and 21 pairs."""
+    run = tmp_path / "on_a_gpu"
+    run.mkdir()
+    checkpoint.save(checkpoint_of(untrained()), run / NETWORK_FILE)
+    progress = RunProgress(seconds=60, steps=7, optimiser_steps=7, pairs=21)
+    (run / PROGRESS_FILE).write_text(json.dumps(asdict(progress)))
+    return run
+
+
+def test_a_timed_run_has_the_scores_of_its_network_and_the_pairs_of_its_progress(timed_run, tmp_path):
+    out = tmp_path / "curve.csv"
+    out.write_text("recipe,step,epe_px\nearlier,7,3.5\non_a_gpu,2,8.8\non_a_gpu,7,9.9\n")
+    recipe = replace(RECIPE, held_out=(("boxes", str(write_box_set(tmp_path / "boxes"))),))
+    scores = record_timed_run(timed_run, recipe, out, Console(quiet=True))
+    with out.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["recipe"], row["step"], row["pairs"]) for row in rows] == [
+        ("earlier", "7", ""),
+        ("on_a_gpu", "2", ""),
+        ("on_a_gpu", "7", "21"),
+    ]
+    held_out = CachedPairs(tmp_path / "pairs", VALIDATION_SEED, 2, RECIPE.pair_size)
+    expected = validate(untrained(), held_out, torch.device("cpu"))
+    assert expected.items() <= scores.items()
+    assert float(rows[-1]["boxes_bad1_percent"]) == pytest.approx(scores["boxes_bad1_percent"], abs=1e-5)

@@ -27,6 +27,7 @@ from learn_examples import (
     recipe_of,
     untrained,
     write,
+    write_box_set,
 )
 from lightning_fabric.loggers.tensorboard import TensorBoardLogger
 from lightning_fabric.utilities.distributed import _destroy_dist_connection
@@ -34,8 +35,6 @@ from other_processes import halted
 from rich.console import Console
 
 from stereoweave.bench.error_classes import CLASSES
-from stereoweave.data.packing import pack
-from stereoweave.data.shards import write_shard
 from stereoweave.errors import FormatError, OutputInUseError, StereoweaveError
 from stereoweave.learn import checkpoint
 from stereoweave.learn.data.batches import Batches
@@ -185,10 +184,8 @@ def test_a_run_is_saved_every_ten_minutes(folder, recipe_file, tmp_path, logger,
 
 
 def test_a_run_is_scored_by_class_on_the_held_out_sets_of_its_recipe(folder, in_place, tmp_path):
-    sample = replace(box_before_a_wall(np.random.default_rng(0)), camera=CAMERA)
-    (tmp_path / "boxes").mkdir()
-    write_shard(tmp_path / "boxes", "boxes", 0, [pack(sample, {})])
-    recipe = replace(RECIPE, name="scored", steps=2, held_out=(("boxes", str(tmp_path / "boxes")),))
+    boxes = write_box_set(tmp_path / "boxes")
+    recipe = replace(RECIPE, name="scored", steps=2, held_out=(("boxes", str(boxes)),))
     kept = checkpoint.load(train(write(recipe, tmp_path / "scored.toml"), folder / "scored", QUIET))
     assert kept.scores["boxes_epe_px"] > 0
     parts = [kept.scores[f"boxes_{name}_bad1_percent"] for name in CLASSES]
