@@ -26,6 +26,11 @@ def _as_pairs(table: object) -> object:
     return tuple(table.items()) if isinstance(table, dict) else table
 
 
+def _as_tuple(values: object) -> object:
+    """Return a TOML array as a tuple, which is hashable; return any other value unchanged."""
+    return tuple(values) if isinstance(values, list) else values
+
+
 # Errors quote these descriptions after "expected".
 Text = Annotated[str, Field(strict=True, description="text in quotes")]
 Switch = Annotated[bool, Field(strict=True, description="true or false")]
@@ -45,6 +50,11 @@ Weights = Annotated[
     tuple[tuple[Text, Positive], ...],
     BeforeValidator(_as_pairs),
     Field(description="a table of sets with weights above 0, such as collage = 0.5"),
+]
+Parts = Annotated[
+    tuple[Text, ...],
+    BeforeValidator(_as_tuple),
+    Field(description='a list of parts, such as ["refinement"]'),
 ]
 Folders = Annotated[
     tuple[tuple[Text, Text], ...],
@@ -102,6 +112,9 @@ class Recipe:
         distribution: Weight of WeaveNet's cross-entropy over disparity levels; 0 for regression only.
         robust: Share of the logarithm in WeaveNet's regression loss, which reduces the effect of large
             errors.
+        steadiness: Weight of WeaveNet's loss on upsampling logits that amplify rounding errors.
+        trained: Parts of the network to train, named by the first part of their parameters' names; the others
+            keep their weights and statistics. Empty for all.
         vgg16_weights: File with VGG-16 weights for the perceptual loss.
     """
 
@@ -143,6 +156,8 @@ class Recipe:
     alpha_p: NonNegative = 0.0
     distribution: NonNegative = 1.0
     robust: Share = 0.0
+    steadiness: NonNegative = 0.0
+    trained: Parts = ()
     vgg16_weights: Text = ""
 
     @property

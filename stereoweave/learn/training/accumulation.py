@@ -21,7 +21,8 @@ class StepSums:
 
     def __init__(self, network: nn.Module) -> None:
         self.parameters = list(network.parameters())
-        self.norms = [layer for layer in network.modules() if isinstance(layer, _BATCH_NORMS)]
+        layers = (layer for layer in network.modules() if isinstance(layer, _BATCH_NORMS))
+        self.norms = [layer for layer in layers if layer.training]
         found = [value for layer in self.norms for value in (layer.running_mean, layer.running_var)]
         self.statistics = [value for value in found if value is not None]
         self.before = [value.clone() for value in self.statistics]

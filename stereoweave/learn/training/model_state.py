@@ -7,8 +7,10 @@ import torch
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel
 
+from stereoweave.errors import FormatError
 from stereoweave.learn.checkpoint import Checkpoint
 from stereoweave.learn.models import build_network
+from stereoweave.learn.recipe import Recipe
 from stereoweave.learn.training.objective import Objective, build_objective
 
 # A step with a loss or gradient that is not finite is skipped. A second such step within this many steps ends
@@ -44,14 +46,42 @@ class ModelState:
                 # bfloat16 convolutions on the CPU are three times as fast in this layout.
                 layer.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.network.to(device)
+        self.fixed = _fix_parts(self.network, recipe)
         self.averaged = AveragedModel(self.network, multi_avg_fn=update_average, use_buffers=True)
         self.averaged.module.load_state_dict(start.averaged)
         self.optimiser = torch.optim.AdamW(
-            self.network.parameters(), recipe.learning_rate, weight_decay=recipe.weight_decay, fused=True
+            [value for value in self.network.parameters() if value.requires_grad],
+            recipe.learning_rate,
+            weight_decay=recipe.weight_decay,
+            fused=True,
         )
         if optimiser_state:
             self.optimiser.load_state_dict(optimiser_state)
 
+    def prepare_to_train(self) -> None:
+        """Switch the network to training, except for the parts that keep their weights and statistics."""
+        self.network.train()
+        for part in self.fixed:
+            part.eval()
+
     def clip_gradient(self) -> Tensor:
         """Scale the gradient down to a norm of at most 5. Returns the norm before scaling."""
         return nn.utils.clip_grad_norm_(self.network.parameters(), _MAX_GRADIENT_NORM)
+
+
+def _fix_parts(network: nn.Module, recipe: Recipe) -> list[nn.Module]:
+    """Exclude all parts but `recipe.trained` from training, unless it is empty. Returns the excluded parts.
+
+    Raises:
+        FormatError: The network has no part of a name.
+    """
+    parts = dict(network.named_children())
+    if unknown := set(recipe.trained) - parts.keys():
+        raise FormatError(
+            f"{recipe.name}: trained: expected parts of {recipe.model}, which are {', '.join(parts)}, "
+            f"found {min(unknown)!r}"
+        )
+    fixed = [part for name, part in parts.items() if recipe.trained and name not in recipe.trained]
+    for part in fixed:
+        part.requires_grad_(False)
+    return fixed

@@ -30,6 +30,7 @@ from stereoweave.learn.training.losses import (
 from stereoweave.learn.training.patches import PatchObjective
 from stereoweave.learn.training.perceptual import PerceptualLoss
 from stereoweave.learn.training.scores import validate
+from stereoweave.learn.training.steadiness import predict_with_amplification
 from stereoweave.learn.training.warp import depth_to_disparity
 from stereoweave.stereo import DepthCurve, Sample, fit_exponent
 
@@ -115,7 +116,10 @@ class WeaveObjective:
         """Accept every batch: truth that the network cannot predict enters no loss."""
 
     def predict(self, network: WeaveNet, batch: Batch) -> WeaveStages:
-        return network.stages(batch["left"], batch["right"])
+        if not self.recipe.steadiness:
+            return network.stages(batch["left"], batch["right"])
+        stages, amplification = predict_with_amplification(network, batch["left"], batch["right"])
+        return replace(stages, amplification=amplification)
 
     def losses(self, predicted: WeaveStages, batch: Batch) -> dict[str, Tensor]:
         truth_px, occluded = batch["disparity_px"], batch["occluded"]
@@ -124,6 +128,8 @@ class WeaveObjective:
             left_px = predicted.disparity_px.chunk(2)[0]
             error = projection_loss(batch["left"], batch["right"], left_px)
             terms["projection"] = self.recipe.alpha_p * error
+        if predicted.amplification is not None:
+            terms["steadiness"] = self.recipe.steadiness * predicted.amplification
         return terms
 
     def scores(self, network: WeaveNet, pairs: PairSource, device: torch.device) -> dict[str, float]:

@@ -61,7 +61,7 @@ class TrainingRun(ModelState):
             group["lr"] = self.recipe.learning_rate_at(step)
         with name_in_errors(f"step {step}: one of {', '.join(batches.names(step))}"):
             self.objective.check(batch)
-        self.network.train()
+        self.prepare_to_train()
         sums = StepSums(self.network)
         terms = self._gradient(step, self.fabric.to_device(batch), batches, sums)
         value = terms.pop("loss")

@@ -121,14 +121,14 @@ class TimedRun(ModelState):
     @torch.no_grad()
     def loss(self, batch: dict[str, Tensor], bfloat16: bool) -> float:
         """Return the loss of a batch in the given precision, without training on it."""
-        self.network.train()
+        self.prepare_to_train()
         value = float(self._loss(batch, bfloat16))
         self._restore_statistics()
         return value
 
     def begin(self, batch: dict[str, Tensor]) -> Tensor:
         """Compute a step's gradient. Returns the step's loss; on a GPU, both are computed asynchronously."""
-        self.network.train()
+        self.prepare_to_train()
         self.objective.check(batch)
         self.optimiser.zero_grad()
         loss = self._loss(batch, self.bfloat16)
