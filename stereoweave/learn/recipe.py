@@ -113,6 +113,8 @@ class Recipe:
         robust: Share of the logarithm in WeaveNet's regression loss, which reduces the effect of large
             errors.
         steadiness: Weight of WeaveNet's loss on upsampling logits that amplify rounding errors.
+        teacher: Checkpoint of a WeaveNet whose results are further targets of a WeaveNet; empty for none.
+        taught: Weight of the losses between the network's results and the teacher's.
         trained: Parts of the network to train, named by the first part of their parameters' names; the others
             keep their weights and statistics. Empty for all.
         vgg16_weights: File with VGG-16 weights for the perceptual loss.
@@ -157,6 +159,8 @@ class Recipe:
     distribution: NonNegative = 1.0
     robust: Share = 0.0
     steadiness: NonNegative = 0.0
+    teacher: Text = ""
+    taught: NonNegative = 0.5
     trained: Parts = ()
     vgg16_weights: Text = ""
 

@@ -128,7 +128,6 @@ class WeaveStages:
         confidence_logit: Log odds that the disparity is within 1 px of the truth [2B, 1, H, W].
         coarse_logits: Logits of the weights that upsample the disparity to 1/2 resolution [2B, K, H/4, W/4].
         fine_logits: Logits of the weights that upsample it to full resolution [2B, K, H/2, W/2].
-        amplification: Excess of training/steadiness.py; None if it was not measured.
     """
 
     correlation: Float[Tensor, "b d h_d w_d"]
@@ -138,7 +137,6 @@ class WeaveStages:
     confidence_logit: Float[Tensor, "b 1 h w"]
     coarse_logits: Float[Tensor, "b kc h4 w4"]
     fine_logits: Float[Tensor, "b kf h2 w2"]
-    amplification: Float[Tensor, ""] | None = None
 
 
 class WeaveFeatures(NamedTuple):

@@ -5,7 +5,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -31,6 +31,7 @@ from stereoweave.learn.training.patches import PatchObjective
 from stereoweave.learn.training.perceptual import PerceptualLoss
 from stereoweave.learn.training.scores import validate
 from stereoweave.learn.training.steadiness import predict_with_amplification
+from stereoweave.learn.training.teacher import Lesson, Teacher, distillation_losses
 from stereoweave.learn.training.warp import depth_to_disparity
 from stereoweave.stereo import DepthCurve, Sample, fit_exponent
 
@@ -84,7 +85,7 @@ def build_objective(recipe: Recipe, network: nn.Module) -> Objective:
     if isinstance(network, MCCNN):
         return PatchObjective(recipe)
     if not isinstance(network, CodeNetwork):
-        return WeaveObjective(recipe)
+        return WeaveObjective(recipe, _load_teacher(recipe, network))
     if recipe.loss == CROSS_ENTROPY and network.predicts != "code":
         raise FormatError(
             f"{recipe.name}: loss = {recipe.loss!r}: expected a network that predicts codes, found "
@@ -93,11 +94,38 @@ def build_objective(recipe: Recipe, network: nn.Module) -> Objective:
     return CodeObjective(recipe, network)
 
 
+def _load_teacher(recipe: Recipe, network: nn.Module) -> Teacher | None:
+    """Load a recipe's teacher, if it has one. Raises FormatError if it has other levels than the network."""
+    if not recipe.teacher:
+        return None
+    teacher = Teacher(Path(recipe.teacher))
+    if teacher.network.levels != network.levels:
+        raise FormatError(
+            f"{recipe.name}: teacher: expected {network.levels} levels as in {recipe.model}, found "
+            f"{teacher.network.levels} in {recipe.teacher}"
+        )
+    return teacher
+
+
 def _list_fitting(network: nn.Module) -> tuple[str, ...]:
     """List the losses that can train a network."""
     if isinstance(network, WeaveNet):
         return (WEAVE,)
     return (HINGE,) if isinstance(network, MCCNN) else (*CODE_LOSSES, PERCEPTUAL)
+
+
+class WeavePrediction(NamedTuple):
+    """What WeaveNet's losses need of a batch.
+
+    Attributes:
+        stages: Results of every stage.
+        amplification: That of the upsampling logits; None if the recipe has no loss on it.
+        lesson: The teacher's results; None if the recipe has no teacher.
+    """
+
+    stages: WeaveStages
+    amplification: Float[Tensor, ""] | None = None
+    lesson: Lesson | None = None
 
 
 class WeaveObjective:
@@ -109,27 +137,31 @@ class WeaveObjective:
 
     recordable = False  # only rendered pairs have cameras, so the batches of a mix differ
 
-    def __init__(self, recipe: Recipe) -> None:
-        self.recipe = recipe
+    def __init__(self, recipe: Recipe, teacher: Teacher | None = None) -> None:
+        self.recipe, self.teacher = recipe, teacher
 
     def check(self, batch: Batch) -> None:
         """Accept every batch: truth that the network cannot predict enters no loss."""
 
-    def predict(self, network: WeaveNet, batch: Batch) -> WeaveStages:
-        if not self.recipe.steadiness:
-            return network.stages(batch["left"], batch["right"])
-        stages, amplification = predict_with_amplification(network, batch["left"], batch["right"])
-        return replace(stages, amplification=amplification)
+    def predict(self, network: WeaveNet, batch: Batch) -> WeavePrediction:
+        views = batch["left"], batch["right"]
+        lesson = self.teacher.teach(*views) if self.teacher else None
+        if self.recipe.steadiness:
+            return WeavePrediction(*predict_with_amplification(network, *views), lesson)
+        return WeavePrediction(network.stages(*views), lesson=lesson)
 
-    def losses(self, predicted: WeaveStages, batch: Batch) -> dict[str, Tensor]:
+    def losses(self, predicted: WeavePrediction, batch: Batch) -> dict[str, Tensor]:
+        stages, recipe = predicted.stages, self.recipe
         truth_px, occluded = batch["disparity_px"], batch["occluded"]
-        terms = weave_losses(predicted, truth_px, occluded, self.recipe.distribution, self._compare)
-        if self.recipe.alpha_p:
-            left_px = predicted.disparity_px.chunk(2)[0]
-            error = projection_loss(batch["left"], batch["right"], left_px)
-            terms["projection"] = self.recipe.alpha_p * error
+        terms = weave_losses(stages, truth_px, occluded, recipe.distribution, self._compare)
+        if recipe.alpha_p:
+            left_px = stages.disparity_px.chunk(2)[0]
+            terms["projection"] = recipe.alpha_p * projection_loss(batch["left"], batch["right"], left_px)
         if predicted.amplification is not None:
-            terms["steadiness"] = self.recipe.steadiness * predicted.amplification
+            terms["steadiness"] = recipe.steadiness * predicted.amplification
+        if predicted.lesson is not None:
+            taught = distillation_losses(stages, predicted.lesson, recipe.robust)
+            terms |= {name: recipe.taught * term for name, term in taught.items()}
         return terms
 
     def scores(self, network: WeaveNet, pairs: PairSource, device: torch.device) -> dict[str, float]:

@@ -8,7 +8,7 @@ from learn_examples import RECIPE, untrained
 
 from stereoweave.learn.models.weave import WeaveStages
 from stereoweave.learn.training.losses import regression_loss, weave_losses
-from stereoweave.learn.training.objective import WeaveObjective, build_objective
+from stereoweave.learn.training.objective import WeaveObjective, WeavePrediction, build_objective
 
 LEVELS = 4
 
@@ -38,7 +38,7 @@ def batch_of(truth_px, height=16, width=32):
 
 
 def losses_of(predicted, batch, **changes):
-    return WeaveObjective(replace(RECIPE, **changes)).losses(predicted, batch)
+    return WeaveObjective(replace(RECIPE, **changes)).losses(WeavePrediction(predicted), batch)
 
 
 def test_a_recipe_that_says_nothing_has_the_loss_as_it_was_to_the_last_bit():
@@ -46,7 +46,7 @@ def test_a_recipe_that_says_nothing_has_the_loss_as_it_was_to_the_last_bit():
     network, batch = untrained(), batch_of(7.3, 32, 64)
     with torch.no_grad():
         predicted = network.stages(batch["left"], batch["right"])
-    found = build_objective(RECIPE, network).losses(predicted, batch)
+    found = build_objective(RECIPE, network).losses(WeavePrediction(predicted), batch)
     assert found == weave_losses(predicted, batch["disparity_px"], batch["occluded"])
     assert found["disparity"] == regression_loss(predicted.disparity_px, batch["disparity_px"])
     assert list(found) == ["correlation", "scores", "coarse", "disparity", "confidence", "logits"]
