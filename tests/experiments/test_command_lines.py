@@ -15,6 +15,7 @@ RECIPE = REPOSITORY / "recipes" / "weave_small.toml"
 PAPER_RECIPE = REPOSITORY / "recipes" / "paper" / "experiment.toml"
 EXPERIMENTS = (
     "ablations",
+    "failures",
     "first_run",
     "handheld",
     "interleaved",

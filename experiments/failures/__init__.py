@@ -1,0 +1,1 @@
+"""Where a network fails: the worst of many pairs with known disparity, drawn."""
