@@ -26,11 +26,6 @@ def _as_pairs(table: object) -> object:
     return tuple(table.items()) if isinstance(table, dict) else table
 
 
-def _as_tuple(values: object) -> object:
-    """Return a TOML array as a tuple, which is hashable; return any other value unchanged."""
-    return tuple(values) if isinstance(values, list) else values
-
-
 # Errors quote these descriptions after "expected".
 Text = Annotated[str, Field(strict=True, description="text in quotes")]
 Switch = Annotated[bool, Field(strict=True, description="true or false")]
@@ -51,11 +46,7 @@ Weights = Annotated[
     BeforeValidator(_as_pairs),
     Field(description="a table of sets with weights above 0, such as collage = 0.5"),
 ]
-Parts = Annotated[
-    tuple[Text, ...],
-    BeforeValidator(_as_tuple),
-    Field(description='a list of parts, such as ["refinement"]'),
-]
+Parts = Annotated[tuple[Text, ...], Field(description='a list of parts, such as ["refinement"]')]
 Folders = Annotated[
     tuple[tuple[Text, Text], ...],
     BeforeValidator(_as_pairs),
@@ -113,7 +104,8 @@ class Recipe:
         robust: Share of the logarithm in WeaveNet's regression loss, which reduces the effect of large
             errors.
         steadiness: Weight of WeaveNet's loss on upsampling logits that amplify rounding errors.
-        teacher: Checkpoint of a WeaveNet whose results are further targets of a WeaveNet; empty for none.
+        teacher: Checkpoint of a trained WeaveNet, whose results are targets beside the ground truth; empty
+            for none.
         taught: Weight of the losses between the network's results and the teacher's.
         trained: Parts of the network to train, named by the first part of their parameters' names; the others
             keep their weights and statistics. Empty for all.

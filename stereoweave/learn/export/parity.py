@@ -32,7 +32,7 @@ from stereoweave.system.threads import thread_count
 # Different from the seeds of recipes, validation, confidence and the variants' own checks.
 _SEED, _PAIRS = 7_000_003, 4
 # Height and width of the pairs. Times are measured at the last size, which is that of the fixed-size file.
-SIZES = ((240, 320), (320, 512), (480, 640))
+SIZES = ((256, 320), (320, 512), (480, 640))
 _TURNS = 7
 
 

@@ -2,6 +2,7 @@
 
 import csv
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -74,7 +75,7 @@ def record_timed_run(run: Path, recipe: Recipe, out: Path, console: Console) -> 
         console: Console for the progress of missing held-out collages.
     """
     kept, progress = checkpoint.load(run / NETWORK_FILE), read_progress(run / PROGRESS_FILE)
-    _, held_out = open_sources(recipe, run.parent / "pairs")
+    _, held_out = open_sources(replace(recipe, mix=()), run.parent / "pairs")  # no training sets are needed
     sets, device = open_held_out_sets(recipe), choose_device()
     cache_pairs(held_out, console)
     network = build_network(kept.recipe)

@@ -22,6 +22,7 @@ from stereoweave.learn.distributed import read_rank, report_once
 from stereoweave.learn.models import build_network
 from stereoweave.learn.recipe import COLLAGE, Recipe, read_recipe
 from stereoweave.learn.training.fabric import keep_freed_memory, make_fabric, skip_teardown_on_error
+from stereoweave.learn.training.model_state import find_fixed_parts
 from stereoweave.learn.training.objective import build_objective, fit_recipe
 from stereoweave.learn.training.run import TrainingRun, load_start
 from stereoweave.learn.training.scores import validate_sets
@@ -145,6 +146,7 @@ def _check_recipe(recipe: Recipe) -> None:
     with torch.device("meta"):
         network = build_network(recipe)
         build_objective(recipe, network)
+        find_fixed_parts(network, recipe)
     multiple = network.multiple_of
     sizes = recipe.crop_size + (recipe.pair_size if recipe.dataset == COLLAGE else ())
     if any(side % multiple for side in sizes):

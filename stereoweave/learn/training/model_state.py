@@ -46,7 +46,9 @@ class ModelState:
                 # bfloat16 convolutions on the CPU are three times as fast in this layout.
                 layer.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.network.to(device)
-        self.fixed = _fix_parts(self.network, recipe)
+        self.fixed = find_fixed_parts(self.network, recipe)
+        for part in self.fixed:
+            part.requires_grad_(False)
         self.averaged = AveragedModel(self.network, multi_avg_fn=update_average, use_buffers=True)
         self.averaged.module.load_state_dict(start.averaged)
         self.optimiser = torch.optim.AdamW(
@@ -69,8 +71,8 @@ class ModelState:
         return nn.utils.clip_grad_norm_(self.network.parameters(), _MAX_GRADIENT_NORM)
 
 
-def _fix_parts(network: nn.Module, recipe: Recipe) -> list[nn.Module]:
-    """Exclude all parts but `recipe.trained` from training, unless it is empty. Returns the excluded parts.
+def find_fixed_parts(network: nn.Module, recipe: Recipe) -> list[nn.Module]:
+    """Return all parts of a network but those in `recipe.trained`; none if it is empty.
 
     Raises:
         FormatError: The network has no part of a name.
@@ -81,7 +83,4 @@ def _fix_parts(network: nn.Module, recipe: Recipe) -> list[nn.Module]:
             f"{recipe.name}: trained: expected parts of {recipe.model}, which are {', '.join(parts)}, "
             f"found {min(unknown)!r}"
         )
-    fixed = [part for name, part in parts.items() if recipe.trained and name not in recipe.trained]
-    for part in fixed:
-        part.requires_grad_(False)
-    return fixed
+    return [part for name, part in parts.items() if recipe.trained and name not in recipe.trained]

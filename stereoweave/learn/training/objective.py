@@ -82,10 +82,12 @@ def build_objective(recipe: Recipe, network: nn.Module) -> Objective:
             f"{recipe.name}: loss: expected {' or '.join(fitting)} for model = {recipe.model!r}, "
             f"found {recipe.loss!r}"
         )
+    if isinstance(network, WeaveNet):
+        return WeaveObjective(recipe, _load_teacher(recipe, network))
+    _refuse_weave_settings(recipe)
     if isinstance(network, MCCNN):
         return PatchObjective(recipe)
-    if not isinstance(network, CodeNetwork):
-        return WeaveObjective(recipe, _load_teacher(recipe, network))
+    assert isinstance(network, CodeNetwork)
     if recipe.loss == CROSS_ENTROPY and network.predicts != "code":
         raise FormatError(
             f"{recipe.name}: loss = {recipe.loss!r}: expected a network that predicts codes, found "
@@ -95,7 +97,7 @@ def build_objective(recipe: Recipe, network: nn.Module) -> Objective:
 
 
 def _load_teacher(recipe: Recipe, network: nn.Module) -> Teacher | None:
-    """Load a recipe's teacher, if it has one. Raises FormatError if it has other levels than the network."""
+    """Load a recipe's teacher, if it has one. Raises FormatError if it does not fit the network or crops."""
     if not recipe.teacher:
         return None
     teacher = Teacher(Path(recipe.teacher))
@@ -104,7 +106,22 @@ def _load_teacher(recipe: Recipe, network: nn.Module) -> Teacher | None:
             f"{recipe.name}: teacher: expected {network.levels} levels as in {recipe.model}, found "
             f"{teacher.network.levels} in {recipe.teacher}"
         )
+    if any(side % teacher.network.multiple_of for side in recipe.crop_size):
+        raise FormatError(
+            f"{recipe.name}: crop_size: expected multiples of {teacher.network.multiple_of} for "
+            f"{recipe.teacher}, found {list(recipe.crop_size)}"
+        )
     return teacher
+
+
+def _refuse_weave_settings(recipe: Recipe) -> None:
+    """Raise FormatError if a recipe of another network has a loss of WeaveNet's alone."""
+    for name in ("steadiness", "teacher"):
+        if value := getattr(recipe, name):
+            raise FormatError(
+                f"{recipe.name}: {name}: expected none for model = {recipe.model!r}, found {value!r}; "
+                "only a WeaveNet has this loss"
+            )
 
 
 def _list_fitting(network: nn.Module) -> tuple[str, ...]:
@@ -160,7 +177,7 @@ class WeaveObjective:
         if predicted.amplification is not None:
             terms["steadiness"] = recipe.steadiness * predicted.amplification
         if predicted.lesson is not None:
-            taught = distillation_losses(stages, predicted.lesson, recipe.robust)
+            taught = distillation_losses(stages, predicted.lesson, self._compare)
             terms |= {name: recipe.taught * term for name, term in taught.items()}
         return terms
 

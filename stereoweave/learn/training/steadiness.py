@@ -1,11 +1,12 @@
 """How much WeaveNet's upsampling logits amplify small changes of their inputs.
 
-At a depth edge, a logit decides between surfaces that may be 100 px apart. Two runtimes round differently; a
-logit that amplifies the difference gives single pixels other disparities in each of them.
+Two runtimes round differently. Where a logit amplifies the difference at a depth edge, a single pixel may get
+disparities that differ by much more than the rounding.
 """
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -13,9 +14,9 @@ from torch import Tensor, nn
 
 from stereoweave.learn.models.weave import WeaveNet, WeaveStages
 
-# Disturbance of the disparity before the refinement, in half-resolution pixels, and of the disparity and the
-# features after the aggregation: far above float32's rounding, and too small to move a match.
-_OF_COARSE, _OF_QUARTER = 0.05, 0.01
+# Disturbance of the disparity before the refinement, in half-resolution pixels, and of the disparity (in
+# levels) and the features after the aggregation: far above float32's rounding, and too small to move a match.
+_COARSE_DISTURBANCE_PX, _QUARTER_DISTURBANCE = 0.05, 0.01
 # Logits may change by this much per unit of the disturbance.
 _LARGEST_AMPLIFICATION = 1.0
 
@@ -23,29 +24,32 @@ _LARGEST_AMPLIFICATION = 1.0
 def predict_with_amplification(
     network: WeaveNet, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
 ) -> tuple[WeaveStages, Float[Tensor, ""]]:
-    """Return the results of every stage, and the amplification of the upsampling logits.
+    """Return the results of every stage, and the mean squared excess of the logits' slopes over 1.
 
-    That is the mean square by which the logits' difference quotients exceed 1. They are computed in float32,
-    since bfloat16 would round the differences away.
+    A slope is a logit's change, divided by the disturbance of the disparity before the refinement, and for
+    the first upsampling of what leaves the aggregation. The excess is summed over both upsamplings. It is
+    computed in float32, since bfloat16 would round the changes away. The logits of the first upsampling count
+    only if the network has a completion.
     """
     watched = [module for module in (network.refinement, network.completion) if module is not None]
     with _record_inputs(watched) as inputs:
         stages = network.stages(left, right)
-    with torch.autocast(left.device.type, enabled=False):
-        excess = _amplify_fine(network, *(x.float() for x in inputs[0]))
+    with torch.autocast(left.device.type, enabled=False), _keep_statistics(network):
+        excess = _measure_fine(network, *(x.float() for x in inputs[network.refinement]))
         if network.completion is not None:
-            excess = excess + _amplify_coarse(network, *(x.float() for x in inputs[1]))
+            excess = excess + _measure_coarse(network, *(x.float() for x in inputs[network.completion]))
     return stages, excess
 
 
 @contextmanager
-def _record_inputs(modules: Sequence[nn.Module]) -> Iterator[list[tuple[Tensor, ...]]]:
-    """Yield a list that holds the inputs of each module's last call."""
-    inputs: list[tuple[Tensor, ...]] = [()] * len(modules)
-    hooks = [
-        module.register_forward_pre_hook(lambda _, given, place=i: inputs.__setitem__(place, given))
-        for i, module in enumerate(modules)
-    ]
+def _record_inputs(modules: Sequence[nn.Module]) -> Iterator[dict[nn.Module, tuple[Tensor, ...]]]:
+    """Yield a dictionary that holds the inputs of each module's last call."""
+    inputs: dict[nn.Module, tuple[Tensor, ...]] = {}
+
+    def record(module: nn.Module, given: tuple[Any, ...]) -> None:
+        inputs[module] = given
+
+    hooks = [module.register_forward_pre_hook(record) for module in modules]
     try:
         yield inputs
     finally:
@@ -53,28 +57,43 @@ def _record_inputs(modules: Sequence[nn.Module]) -> Iterator[list[tuple[Tensor, 
             hook.remove()
 
 
-def _amplify_fine(network: WeaveNet, disparity: Tensor, *others: Tensor) -> Tensor:
-    moved = disparity + _OF_COARSE * torch.randn_like(disparity).sign()
-    _, before, _ = network.refinement(disparity, *others)
-    _, after, _ = network.refinement(moved, *others)
-    return _mean_excess((after - before) / _OF_COARSE)
+@contextmanager
+def _keep_statistics(network: nn.Module) -> Iterator[None]:
+    """Let batch norms in training mode normalise by the batch, without changing their running statistics."""
+    kinds = (nn.BatchNorm2d, nn.SyncBatchNorm)
+    norms = [layer for layer in network.modules() if isinstance(layer, kinds) and layer.training]
+    for norm in norms:
+        norm.track_running_stats = False
+    try:
+        yield
+    finally:
+        for norm in norms:
+            norm.track_running_stats = True
 
 
-def _amplify_coarse(
-    network: WeaveNet, disparity: Tensor, other: Tensor, quarter: Tensor, decoded: Tensor
-) -> Tensor:
-    def weigh(*moved: Tensor) -> Tensor:
-        assert network.completion is not None
-        spread, features = network.completion(moved[0], moved[1], quarter, moved[2])
-        if network.propagation is not None:
-            _, features = network.propagation(spread, quarter, features)
-        logits: Tensor = network.weights(features)
+def _measure_fine(network: WeaveNet, disparity: Tensor, *others: Tensor) -> Tensor:
+    def compute_logits(disparity: Tensor) -> Tensor:
+        _, logits, _ = network.refinement(disparity, *others)
         return logits
 
+    moved = disparity + _COARSE_DISTURBANCE_PX * torch.randn_like(disparity).sign()
+    return _mean_excess((compute_logits(moved) - compute_logits(disparity)) / _COARSE_DISTURBANCE_PX)
+
+
+def _measure_coarse(
+    network: WeaveNet, disparity: Tensor, other: Tensor, quarter: Tensor, decoded: Tensor
+) -> Tensor:
+    def compute_logits(disparity: Tensor, other: Tensor, decoded: Tensor) -> Tensor:
+        assert network.completion is not None
+        spread, features = network.completion(disparity, other, quarter, decoded)
+        if network.propagation is not None:
+            _, features = network.propagation(spread, quarter, features)
+        return network.weights(features)
+
     before = (disparity, other, decoded)
-    after = (x + _OF_QUARTER * torch.randn_like(x) for x in before)
-    return _mean_excess((weigh(*after) - weigh(*before)) / _OF_QUARTER)
+    after = (x + _QUARTER_DISTURBANCE * torch.randn_like(x) for x in before)
+    return _mean_excess((compute_logits(*after) - compute_logits(*before)) / _QUARTER_DISTURBANCE)
 
 
-def _mean_excess(amplification: Tensor) -> Tensor:
-    return (amplification.abs() - _LARGEST_AMPLIFICATION).clamp(min=0).square().mean()
+def _mean_excess(slope: Tensor) -> Tensor:
+    return (slope.abs() - _LARGEST_AMPLIFICATION).clamp(min=0).square().mean()

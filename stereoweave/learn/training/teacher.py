@@ -4,6 +4,7 @@ Its distribution over the levels says which other levels are plausible, which th
 (Hinton et al., Distilling the Knowledge in a Neural Network, 2015).
 """
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,18 +17,17 @@ from stereoweave.errors import FormatError
 from stereoweave.learn import checkpoint
 from stereoweave.learn.models import build_network
 from stereoweave.learn.models.weave import WeaveNet, WeaveStages
-from stereoweave.learn.training.losses import regression_loss
 
 
 class Lesson(NamedTuple):
     """The teacher's results for both views; the second half of the batch is mirrored.
 
     Attributes:
-        shares: Probability of each level at 1/4 resolution.
-        disparity_px: Disparity in pixels.
+        probabilities: Probability of each level [2B, D, H/4, W/4].
+        disparity_px: Disparity [2B, 1, H, W].
     """
 
-    shares: Float[Tensor, "b d h_d w_d"]
+    probabilities: Float[Tensor, "b d h_d w_d"]
     disparity_px: Float[Tensor, "b 1 h w"]
 
 
@@ -56,14 +56,16 @@ class Teacher:
         return Lesson(stages.scores.float().softmax(1), stages.disparity_px)
 
 
-def distillation_losses(stages: WeaveStages, lesson: Lesson, robust: float) -> dict[str, Tensor]:
+def distillation_losses(
+    stages: WeaveStages, lesson: Lesson, compare: Callable[[Tensor, Tensor], Tensor]
+) -> dict[str, Tensor]:
     """Return the terms that draw a prediction to the teacher's, by name.
 
-    They are the cross-entropy between the distributions over the levels, and the regression loss to the
-    teacher's disparity. Both count every pixel, also where the ground truth is unknown.
+    They are the cross-entropy between the distributions over the levels, and the loss `compare` between the
+    disparities in px. Both count every pixel, also where the ground truth is unknown.
     """
-    log_shares = F.log_softmax(stages.scores.float(), 1)
+    log_probabilities = F.log_softmax(stages.scores.float(), 1)
     return {
-        "taught_scores": -(lesson.shares * log_shares).sum(1).mean(),
-        "taught_disparity": regression_loss(stages.disparity_px, lesson.disparity_px, robust),
+        "taught_scores": -(lesson.probabilities * log_probabilities).sum(1).mean(),
+        "taught_disparity": compare(stages.disparity_px, lesson.disparity_px),
     }

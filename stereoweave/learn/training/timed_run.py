@@ -79,6 +79,11 @@ def find_resume_point(recipe: Recipe, out: Path, earlier: Path | None, commit: s
             f"{folder / NETWORK_FILE}: expected a run of {recipe.model}, found a run of {last.recipe.model}; "
             "use another folder"
         )
+    if last.recipe.trained != recipe.trained:
+        raise StereoweaveError(
+            f"{folder / NETWORK_FILE}: expected trained = {list(recipe.trained)}, found "
+            f"{list(last.recipe.trained)}; use another folder"
+        )
     optimiser = _read_optimiser(folder / OPTIMISER_FILE)
     if not optimiser:
         progress = replace(progress, optimiser_steps=0)
@@ -87,7 +92,7 @@ def find_resume_point(recipe: Recipe, out: Path, earlier: Path | None, commit: s
 
 
 def read_progress(path: Path) -> RunProgress:
-    """Read the progress of a timed run. Raises FormatError if the file's contents are others."""
+    """Read the progress of a timed run. Raises FormatError if the file holds anything else."""
     try:
         return RunProgress(**json.loads(path.read_text(encoding="utf-8")))
     except (ValueError, TypeError) as error:
@@ -120,9 +125,14 @@ class TimedRun(ModelState):
 
     @torch.no_grad()
     def loss(self, batch: dict[str, Tensor], bfloat16: bool) -> float:
-        """Return the loss of a batch in the given precision, without training on it."""
+        """Return the loss of a batch in the given precision, without training on it.
+
+        Random numbers are those of seed 0, so that the losses of two precisions can be compared.
+        """
         self.prepare_to_train()
-        value = float(self._loss(batch, bfloat16))
+        with torch.random.fork_rng():
+            torch.manual_seed(0)
+            value = float(self._loss(batch, bfloat16))
         self._restore_statistics()
         return value
 

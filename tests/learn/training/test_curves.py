@@ -83,7 +83,8 @@ def timed_run(tmp_path):
 def test_a_timed_run_has_the_scores_of_its_network_and_the_pairs_of_its_progress(timed_run, tmp_path):
     out = tmp_path / "curve.csv"
     out.write_text("recipe,step,epe_px\nearlier,7,3.5\non_a_gpu,2,8.8\non_a_gpu,7,9.9\n")
-    recipe = replace(RECIPE, held_out=(("boxes", str(write_box_set(tmp_path / "boxes"))),))
+    boxes = write_box_set(tmp_path / "boxes")
+    recipe = replace(RECIPE, mix=(("not_here", 1.0),), held_out=(("boxes", str(boxes)),))
     scores = record_timed_run(timed_run, recipe, out, Console(quiet=True))
     with out.open(newline="") as file:
         rows = list(csv.DictReader(file))

@@ -36,8 +36,9 @@ def test_only_the_trained_parts_change_their_weights_and_statistics(folder, micr
     assert {name for name in after if name.startswith("weights.")} <= changed
 
 
-def test_a_part_that_the_network_lacks_is_named(folder):
+def test_a_part_that_the_network_lacks_is_named_before_any_pair_is_made(tmp_path):
     recipe = replace(SHORT, name="lacking", trained=("refinement", "sharpening"))
-    message = complaint(run, folder, recipe)
+    message = complaint(run, tmp_path, recipe)
+    assert not (tmp_path / "pairs").exists()
     assert message.startswith("lacking: trained: expected parts of weave_small, which are encoder, to_match,")
     assert message.endswith("found 'sharpening'")

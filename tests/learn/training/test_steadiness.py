@@ -54,6 +54,15 @@ def test_the_stages_are_those_of_a_prediction_without_the_amplification():
     assert torch.equal(stages.disparity_px, network.stages(*views()).disparity_px)
 
 
+@pytest.mark.parametrize("name", ["weave_small", "weave_base_grown"])
+def test_batch_norms_record_one_pass(name):
+    plain, measured = untrained(name).train(), untrained(name).train()
+    plain.stages(*views())
+    predict_with_amplification(measured, *views())
+    for expected, found in zip(plain.buffers(), measured.buffers(), strict=True):
+        assert torch.equal(found, expected)
+
+
 def test_the_loss_of_a_recipe_has_the_amplification_only_if_it_asks_for_it():
     network = untrained("weave_small")
     left, right = views()

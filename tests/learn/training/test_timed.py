@@ -190,6 +190,10 @@ def test_files_from_which_no_run_can_resume_are_named(tmp_path):
     assert "expected a run of weave_base, found a run of weave_small" in complaint(
         find_resume_point, other, tmp_path, None, ""
     )
+    parts = replace(RECIPE, trained=("refinement",))
+    assert "expected trained = ['refinement'], found []" in complaint(
+        find_resume_point, parts, tmp_path, None, ""
+    )
     (tmp_path / PROGRESS_FILE).write_text("{}x")
     assert "expected the progress of a timed run" in complaint(find_resume_point, RECIPE, tmp_path, None, "")
 
