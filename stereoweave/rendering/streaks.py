@@ -1,0 +1,34 @@
+"""Smoothing of streaks in disparity at the border that only one camera sees."""
+
+import numpy as np
+from jaxtyping import Bool, Float32
+
+from stereoweave.stereo import Estimate
+
+# Streaks are a few rows high, and depth edges there rarely follow the rows.
+_ROWS = 11
+
+
+def smooth_streaks(estimate: Estimate) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
+    """Return the left and right disparity in px, smoothed where a match would be outside the other picture.
+
+    Nothing is matched there, so the disparities of neighbouring rows hardly agree. Each pixel there becomes
+    the median of 11 pixels of its column; all others stay.
+    """
+    left_px, right_px = estimate.disparity_px, estimate.right_disparity_px
+    columns = np.arange(left_px.shape[1])
+    return (
+        _take_median_of_columns(left_px, left_px > columns),
+        _take_median_of_columns(right_px, right_px > columns[::-1]),
+    )
+
+
+def _take_median_of_columns(
+    disparity_px: Float32[np.ndarray, "h w"], where: Bool[np.ndarray, "h w"]
+) -> Float32[np.ndarray, "h w"]:
+    rows, columns = np.nonzero(where)
+    around = rows[:, None] + np.arange(_ROWS) - _ROWS // 2
+    around = around.clip(0, len(disparity_px) - 1)
+    smoothed_px = disparity_px.copy()
+    smoothed_px[rows, columns] = np.median(disparity_px[around, columns[:, None]], axis=1)
+    return smoothed_px

@@ -1,0 +1,43 @@
+import numpy as np
+
+from stereoweave.rendering.streaks import smooth_streaks
+from stereoweave.stereo import Estimate
+
+HEIGHT, WIDTH = 24, 40
+
+
+def smooth(left_px, right_px):
+    estimate = Estimate(
+        disparity_px=left_px,
+        right_disparity_px=right_px,
+        confidence=np.ones_like(left_px),
+        occluded=np.zeros(left_px.shape, bool),
+    )
+    return smooth_streaks(estimate)
+
+
+def plane(disparity_px=10.0):
+    return np.full((HEIGHT, WIDTH), disparity_px, np.float32)
+
+
+def test_a_streak_vanishes_where_nothing_can_match_and_stays_where_something_can():
+    left_px, right_px = plane(), plane()
+    left_px[8:11], right_px[14:17] = 14, 14
+    smoothed_left_px, smoothed_right_px = smooth(left_px, right_px)
+    # Columns 0 to 13 of a disparity of 14 px have no match.
+    assert (smoothed_left_px[:, :14] == 10).all()
+    assert np.array_equal(smoothed_left_px[:, 14:], left_px[:, 14:])
+    assert (smoothed_right_px[:, -14:] == 10).all()
+    assert np.array_equal(smoothed_right_px[:, :-14], right_px[:, :-14])
+
+
+def test_a_surface_of_six_rows_or_more_keeps_its_edges():
+    left_px = plane()
+    left_px[:12] = 14
+    assert np.array_equal(smooth(left_px, plane())[0], left_px)
+
+
+def test_negative_disparities_match_everywhere_in_the_left_border():
+    left_px = plane(-3.0)
+    left_px[5] = -4
+    assert np.array_equal(smooth(left_px, left_px)[0], left_px)
