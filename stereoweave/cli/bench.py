@@ -288,20 +288,23 @@ def parity(
 @bench.command()
 @shows_steps
 def training(
-    run: Annotated[Path, typer.Argument(help="Run folder of stereoweave train.")],
+    run: Annotated[
+        Path,
+        typer.Argument(help="Run folder of stereoweave train, or with --recipe of recipes/gpu/train.py."),
+    ],
     out: Annotated[Path, typer.Option("--out", "-o", help="CSV file to write; rows of other runs are kept.")],
     recipe: Annotated[
         Path | None,
         typer.Option(
             metavar="RECIPE",
-            help="Recipe on whose held-out pairs and sets a run of recipes/gpu/train.py is scored first.",
+            help="Score a run of recipes/gpu/train.py on the held-out pairs and sets of this recipe.",
         ),
     ] = None,
 ) -> None:
     """Record a run's learning curve, and fit power laws to it.
 
-    The curve shows held-out scores against the number of pairs seen. A run that was trained for a
-    fixed time has one row for each state that was recorded, and no fit.
+    The curve shows held-out scores against the number of pairs seen. With --recipe, one row is
+    recorded, and nothing is fitted.
     """
     make_parent_folder(out)
     from rich.console import Console

@@ -24,6 +24,7 @@ from stereoweave.matching.occlusion_fill import fill_occluded
 from stereoweave.matching.options import MatchOptions
 from stereoweave.matching.providers import CPU, PROVIDERS, explain_failure, open_session
 from stereoweave.matching.refine import refine
+from stereoweave.matching.streaks import smooth_streaks
 from stereoweave.matching.subpixel import to_subpixel
 from stereoweave.stereo import LONGEST_SIDE_PX, Estimate, StereoPair
 from stereoweave.system.threads import thread_count
@@ -169,16 +170,17 @@ class Matcher:
         return [self.finish(pair, own, refined=refined) for pair, own in zip(pairs, found, strict=True)]
 
     def finish(self, pair: StereoPair, found: Estimate, *, refined: bool = False) -> Estimate:
-        """Post-process the network's estimate: refine it to subpixel accuracy and fill occluded pixels.
+        """Post-process the network's estimate: refine it, fill occluded pixels and smooth streaks.
 
-        If `refined` or the matcher's preset requests it, `refine.refine` matches the pair once more between
-        these two steps. The preset then corrects edges and speckles (`vote_at_edges`).
+        The first step refines to subpixel accuracy. If `refined` or the matcher's preset requests it,
+        `refine.refine` then matches the pair once more. Streaks are smoothed beyond the other picture. The
+        preset finally corrects edges and speckles (`vote_at_edges`).
         """
         found = to_subpixel(pair.left, pair.right, found, self.threads)
         if refined or self.refines:
             found = refine(pair.left, pair.right, found, self.threads)
             found = to_subpixel(pair.left, pair.right, found, self.threads)
-        found = fill_occluded(found, pair.left_seen)
+        found = smooth_streaks(fill_occluded(found, pair.left_seen))
         return vote_at_edges(pair.left, found, self.threads) if self.refines else found
 
     def _check_sizes(self, pairs: Sequence[StereoPair]) -> None:

@@ -15,7 +15,6 @@ from stereoweave.arguments import check_kind, check_number
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.arrays import ImageLike, as_rgb
 from stereoweave.matching.exposure import match_exposure, recolour
-from stereoweave.rendering.streaks import smooth_streaks
 from stereoweave.stereo import Estimate, StereoCamera, StereoPair, View, assume_camera, check_fits
 from stereoweave.system.threads import in_bands, thread_count
 
@@ -61,7 +60,7 @@ class Renderer:
         self.pair, self.estimate = pair, estimate
         self.strength, self.convergence_px, self.fine = strength, convergence_px, fine
         self._threads = min(_MOST_THREADS, thread_count(threads))
-        maps_px = smooth_streaks(estimate)
+        maps_px = estimate.disparity_px, estimate.right_disparity_px
         with ThreadPoolExecutor(self._threads) as pool:
             looks = pool.submit(match_exposure, pair.left, pair.right, estimate)
             self._sides = tuple(pool.map(_make_side, (pair.left, pair.right), maps_px, fine or (None, None)))

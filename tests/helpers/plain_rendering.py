@@ -4,8 +4,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stereoweave.rendering.streaks import smooth_streaks
-
 SAME_SURFACE_PX = 3.0
 
 
@@ -29,10 +27,17 @@ def plain_rendering(left, right, estimate, position, convergence_px=0.0):
     """
     near, far = abs(1 - position) ** 0.5, abs(position) ** 0.5
     offset_px = (position - 0.5) * convergence_px
-    left_px, right_px = (disparity_px.astype(float) for disparity_px in smooth_streaks(estimate))
     sides = (
-        PlainSide(left.astype(float), left_px, -position, near / (near + far), offset_px),
-        PlainSide(right.astype(float), right_px, 1 - position, far / (near + far), offset_px),
+        PlainSide(
+            left.astype(float), estimate.disparity_px.astype(float), -position, near / (near + far), offset_px
+        ),
+        PlainSide(
+            right.astype(float),
+            estimate.right_disparity_px.astype(float),
+            1 - position,
+            far / (near + far),
+            offset_px,
+        ),
     )
     front, back, share = plain_surfaces(sides, estimate.confidence)
     supports = [support(side, np.nan_to_num(front), purity(side)) for side in sides]

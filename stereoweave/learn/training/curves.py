@@ -66,13 +66,17 @@ def record_curve(run: Path, out: Path) -> dict[str, PowerLaw]:
 def record_timed_run(run: Path, recipe: Recipe, out: Path, console: Console) -> dict[str, float]:
     """Score a timed run on a recipe's held-out pairs, and write the row to a CSV file. Returns the scores.
 
-    All other rows of the file are kept and come first.
+    All other rows of the file are kept and come first. Missing held-out collages are painted into the folder
+    `pairs` beside the run's.
 
     Args:
         run: Folder with the network and the progress of a timed run.
         recipe: Recipe of the held-out pairs and sets.
         out: CSV file to write, with the columns of `record_curve`.
         console: Console for the progress of missing held-out collages.
+
+    Raises:
+        FormatError: A file of the run or a held-out set is missing or broken.
     """
     kept, progress = checkpoint.load(run / NETWORK_FILE), read_progress(run / PROGRESS_FILE)
     _, held_out = open_sources(replace(recipe, mix=()), run.parent / "pairs")  # no training sets are needed
@@ -81,9 +85,8 @@ def record_timed_run(run: Path, recipe: Recipe, out: Path, console: Console) -> 
     network = build_network(kept.recipe)
     network.load_state_dict(kept.averaged)
     network.to(device).eval()
-    scores = {"step": float(progress.steps)} | validate(network, held_out, device)
-    scores |= validate_sets(network, sets, device)
-    row = _make_row(run, progress.pairs, scores, kept.commit)
+    scores = validate(network, held_out, device) | validate_sets(network, sets, device)
+    row = _make_row(run, progress.pairs, {"step": progress.steps, **scores}, kept.commit)
     others = [one for one in _read(out) if (one["recipe"], one["step"]) != (run.name, str(progress.steps))]
     _write(out, [*others, row])
     return scores

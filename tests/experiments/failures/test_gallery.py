@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -33,6 +35,12 @@ def test_the_worst_pair_of_each_set_is_found_and_the_worst_comes_first():
     assert found[1].epe_px == pytest.approx(6 / 4)
     assert found[1].worst_class == "textured"
     assert 20 < found[1].worst_class_bad2_percent <= 25
+
+
+def test_a_pair_without_known_disparity_is_left_out():
+    scene, estimate = scene_of("a/1", 64)
+    unknown = replace(scene, truth_px=np.full_like(scene.truth_px, np.nan))
+    assert find_failures([(unknown, estimate)], 1) == []
 
 
 def test_a_row_shows_left_picture_truth_estimate_and_error():

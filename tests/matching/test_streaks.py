@@ -1,6 +1,6 @@
 import numpy as np
 
-from stereoweave.rendering.streaks import smooth_streaks
+from stereoweave.matching.streaks import smooth_streaks
 from stereoweave.stereo import Estimate
 
 HEIGHT, WIDTH = 24, 40
@@ -13,7 +13,8 @@ def smooth(left_px, right_px):
         confidence=np.ones_like(left_px),
         occluded=np.zeros(left_px.shape, bool),
     )
-    return smooth_streaks(estimate)
+    smoothed = smooth_streaks(estimate)
+    return smoothed.disparity_px, smoothed.right_disparity_px
 
 
 def plane(disparity_px=10.0):

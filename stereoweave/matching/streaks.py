@@ -1,5 +1,7 @@
 """Smoothing of streaks in disparity at the border that only one camera sees."""
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Bool, Float32
 
@@ -9,17 +11,18 @@ from stereoweave.stereo import Estimate
 _ROWS = 11
 
 
-def smooth_streaks(estimate: Estimate) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
-    """Return the left and right disparity in px, smoothed where a match would be outside the other picture.
+def smooth_streaks(estimate: Estimate) -> Estimate:
+    """Smooth both disparity maps where a match would be outside the other picture.
 
     Nothing is matched there, so the disparities of neighbouring rows hardly agree. Each pixel there becomes
     the median of 11 pixels of its column; all others stay.
     """
     left_px, right_px = estimate.disparity_px, estimate.right_disparity_px
     columns = np.arange(left_px.shape[1])
-    return (
-        _take_median_of_columns(left_px, left_px > columns),
-        _take_median_of_columns(right_px, right_px > columns[::-1]),
+    return replace(
+        estimate,
+        disparity_px=_take_median_of_columns(left_px, left_px > columns),
+        right_disparity_px=_take_median_of_columns(right_px, right_px > columns[::-1]),
     )
 
 
