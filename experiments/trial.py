@@ -25,7 +25,9 @@ class Trial:
 def fingerprint(recipe: Recipe) -> str:
     """Return the hash of a recipe without its name and the place of the runs, in 8 hexadecimal digits.
 
-    Settings at their defaults do not count, so that a recipe keeps its hash when recipes get new settings.
+    Settings at their defaults do not count, so that a recipe keeps its hash when recipes get new settings. A
+    setting whose default changes must get another name: else trainings with the old default count as those
+    with the new one.
     """
     start_from = "/".join(Path(recipe.start_from).parts[-2:])
     changed = {

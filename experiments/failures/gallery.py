@@ -27,7 +27,7 @@ class Failure:
     Attributes:
         scene: Name of the pair.
         epe_px, bad2_percent: Mean error, and share of the known pixels that are off by more than 2 px.
-        worst_class: Class of pixels (bench/error_classes.py) that most of these belong to.
+        worst_class: Class of pixels (bench/error_classes.py) with the largest part of bad2_percent.
         worst_class_bad2_percent: Its part of bad2_percent.
     """
 
@@ -43,14 +43,16 @@ def find_failures(
 ) -> list[tuple[Failure, Scene, Estimate]]:
     """Return the pairs with the highest bad-2, at most one of each set, the worst first.
 
-    The set of a pair is its name up to the last slash.
+    The set of a pair is its name up to the last slash. Pairs without known disparity are left out.
     """
     worst: dict[str, tuple[Failure, Scene, Estimate]] = {}
     for scene, estimate in matched:
+        if not np.isfinite(scene.truth_px).any():
+            continue
         failure = _measure(scene, estimate)
-        place = scene.name.rpartition("/")[0]
-        if place not in worst or failure.bad2_percent > worst[place][0].bad2_percent:
-            worst[place] = failure, scene, estimate
+        set_name = scene.name.rpartition("/")[0]
+        if set_name not in worst or failure.bad2_percent > worst[set_name][0].bad2_percent:
+            worst[set_name] = failure, scene, estimate
     return sorted(worst.values(), key=lambda found: -found[0].bad2_percent)[:count]
 
 
