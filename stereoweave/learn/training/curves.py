@@ -49,8 +49,12 @@ def record_curve(run: Path, out: Path) -> dict[str, PowerLaw]:
         out: CSV file to write, with recipe, step, pairs seen, scores, commit and machine.
 
     Raises:
-        StereoweaveError: If the run has no scores yet.
+        StereoweaveError: If the run has no scores yet, or is a timed run.
     """
+    if (run / PROGRESS_FILE).exists():
+        raise StereoweaveError(
+            f"{run}: expected a recipe for a run of recipes/gpu/train.py, found none; add --recipe RECIPE"
+        )
     kept, record = checkpoint.load(run / "last.pt"), read_scores(run / SCORES_FILE)
     if not record:
         raise StereoweaveError(

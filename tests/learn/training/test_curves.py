@@ -4,7 +4,15 @@ from dataclasses import asdict, replace
 
 import pytest
 import torch
-from learn_examples import RECIPE, checkpoint_of, complaint, untrained, write_box_set
+from learn_examples import (
+    RECIPE,
+    checkpoint_of,
+    complaint,
+    keep_pairs,
+    untrained,
+    write,
+    write_box_set,
+)
 from rich.console import Console
 
 from stereoweave.cli.root import main
@@ -97,3 +105,19 @@ def test_a_timed_run_has_the_scores_of_its_network_and_the_pairs_of_its_progress
     expected = validate(untrained(), held_out, torch.device("cpu"))
     assert expected.items() <= scores.items()
     assert float(rows[-1]["boxes_bad1_percent"]) == pytest.approx(scores["boxes_bad1_percent"], abs=1e-5)
+
+
+def test_the_command_scores_a_timed_run_with_a_recipe(timed_run, tmp_path, capsys):
+    keep_pairs(tmp_path / "pairs", VALIDATION_SEED, RECIPE.validation_pairs)
+    recipe = write(RECIPE, tmp_path / "tiny.toml")
+    line = ["bench", "training", str(timed_run), "--recipe", str(recipe), "-o", str(tmp_path / "curve.csv")]
+    assert main(line) == 0
+    assert "bad1_percent: " in capsys.readouterr().out
+    assert "on_a_gpu,7,21" in (tmp_path / "curve.csv").read_text()
+
+
+def test_a_timed_run_needs_a_recipe(timed_run, tmp_path):
+    message = complaint(record_curve, timed_run, tmp_path / "curve.csv")
+    assert message == (
+        f"{timed_run}: expected a recipe for a run of recipes/gpu/train.py, found none; add --recipe RECIPE"
+    )
