@@ -96,8 +96,8 @@ def found_raw(testdata, name):
     [
         ("small", False, (1.8, 24.0, 15.0)),
         ("small", True, (1.6, 20.0, 11.5)),
-        ("base", False, (1.05, 17.0, 10.0)),
-        ("base", True, (0.95, 14.6, 8.4)),
+        ("base", False, (0.8, 10.8, 5.9)),
+        ("base", True, (0.76, 10.1, 5.4)),
     ],
 )
 def test_on_real_pairs_the_network_is_as_good_as_promised(testdata, name, refined, most):
