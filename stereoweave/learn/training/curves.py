@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from rich.console import Console
 
-from stereoweave.errors import StereoweaveError
+from stereoweave.errors import Remedy, StereoweaveError
 from stereoweave.io.files import replacing
 from stereoweave.learn import checkpoint
 from stereoweave.learn.data.sources import cache_pairs, open_held_out_sets, open_sources
@@ -53,7 +53,8 @@ def record_curve(run: Path, out: Path) -> dict[str, PowerLaw]:
     """
     if (run / PROGRESS_FILE).exists():
         raise StereoweaveError(
-            f"{run}: expected a recipe for a run of recipes/gpu/train.py, found none; add --recipe RECIPE"
+            f"{run}: expected a recipe for a run of recipes/gpu/train.py, found none",
+            remedy=Remedy("give the recipe of its held-out pairs", ("recipe",)),
         )
     kept, record = checkpoint.load(run / "last.pt"), read_scores(run / SCORES_FILE)
     if not record:

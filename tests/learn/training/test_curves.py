@@ -116,8 +116,10 @@ def test_the_command_scores_a_timed_run_with_a_recipe(timed_run, tmp_path, capsy
     assert "on_a_gpu,7,21" in (tmp_path / "curve.csv").read_text()
 
 
-def test_a_timed_run_needs_a_recipe(timed_run, tmp_path):
-    message = complaint(record_curve, timed_run, tmp_path / "curve.csv")
-    assert message == (
-        f"{timed_run}: expected a recipe for a run of recipes/gpu/train.py, found none; add --recipe RECIPE"
-    )
+def test_a_timed_run_needs_a_recipe(timed_run, tmp_path, capsys):
+    curve = tmp_path / "curve.csv"
+    message = f"{timed_run}: expected a recipe for a run of recipes/gpu/train.py, found none; "
+    advice = "give the recipe of its held-out pairs"
+    assert complaint(record_curve, timed_run, curve) == f"{message}{advice} (recipe)"
+    assert main(["bench", "training", str(timed_run), "-o", str(curve)]) == 2
+    assert f"{message}{advice} (--recipe)" in capsys.readouterr().err
