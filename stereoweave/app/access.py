@@ -17,17 +17,17 @@ _POLICY = "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:"
 _REFUSED = "access is limited to your uploads and the files made from them; upload the pictures again"
 _COOKIE = "stereoweave-visitor"
 _VISITOR = re.compile(r"[\w-]{43}", re.ASCII)
-_API = "/gradio_api"
-_FILE = f"{_API}/file="
+API = "/gradio_api"
+_FILE = f"{API}/file="
 # Gradio's other routes stay closed: unqueued calls, a proxy, recordings, streams and component functions.
 _ROUTES = re.compile(
     r"/|/(config|theme\.css|favicon\.ico|manifest\.json|robots\.txt)|/(static|assets|svelte)(/[\w-][\w.-]*)+"
-    rf"|{_API}/(info|app_id|startup-events|upload|upload_progress|queue/join|queue/data|reset|cancel)/?"
-    rf"|{_API}/heartbeat/\w+|{_FILE}.+",
+    rf"|{API}/(info|app_id|startup-events|upload|upload_progress|queue/join|queue/data|reset|cancel)/?"
+    rf"|{API}/heartbeat/\w+|{_FILE}.+",
     re.DOTALL,
 )
 # Routes whose responses contain paths of files for the visitor.
-_NAMING = (f"{_API}/upload", f"{_API}/queue/data")
+_NAMING = (f"{API}/upload", f"{API}/queue/data")
 _MOST_BODY_BYTES = 1_000_000
 # A path takes about 200 bytes; a visitor who studies a pair for an hour receives hundreds of paths.
 _MOST_NAMED = 10_000
@@ -60,7 +60,7 @@ class OwnFiles:
         if scope["type"] == "lifespan":
             await self._app(scope, receive, send)
             return
-        visitor = _find_visitor(scope)
+        visitor = find_visitor(scope)
         try:
             receive = await self._checked(scope, receive, visitor)
         except PermissionError:
@@ -85,7 +85,7 @@ class OwnFiles:
             raise PermissionError
         if path.startswith(_FILE):
             self._check([path.removeprefix(_FILE)], visitor)
-        elif method not in ("GET", "HEAD") and path != f"{_API}/upload":
+        elif method not in ("GET", "HEAD") and path != f"{API}/upload":
             value, text = await _read_json(Request(scope, receive))
             self._check(list(_find_paths(value)), visitor)
             return _replay(text, receive)
@@ -150,7 +150,7 @@ def _use(entries: OrderedDict[str, Any], key: str, most: int) -> None:
         entries.popitem(last=False)
 
 
-def _find_visitor(scope: Scope) -> str:
+def find_visitor(scope: Scope) -> str:
     """Return the visitor's cookie, or an empty string if there is none."""
     # Parsed by hand, because some versions of Python take quadratic time to unquote a cookie.
     for header in Headers(scope=scope).getlist("cookie"):

@@ -18,6 +18,7 @@ from starlette.middleware.trustedhost import TrustedHostMiddleware
 from stereoweave.app.access import ContentPolicy, OwnFiles
 from stereoweave.app.events import Host
 from stereoweave.app.page import make_page
+from stereoweave.app.streams import EndedStreams
 from stereoweave.app.workers import Workers
 from stereoweave.matching.providers import CPU
 from stereoweave.pictures.sample import sample_folder
@@ -54,6 +55,7 @@ def make_server(host: Host, names: Sequence[str] | None) -> FastAPI:
         head=_NARROW,
     )
     server.add_middleware(OwnFiles)
+    server.add_middleware(EndedStreams)
     if names is not None:
         server.add_middleware(TrustedHostMiddleware, allowed_hosts=names, www_redirect=False)
     server.add_middleware(ContentPolicy)

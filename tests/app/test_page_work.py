@@ -33,6 +33,23 @@ from stereoweave.pictures.prepare import Request, prepare
 TEXTURED = Path(__file__).resolve().parents[1] / "textured_pair"
 WIDTH, HEIGHT = 320, 240
 WAIT_S = 60
+# A window reads the end of a stream of results a second late.
+LATE_ENDS = """
+const load = window.fetch;
+window.fetch = async (...given) => {
+    const answer = await load(...given);
+    if (!String(given[0].url ?? given[0]).includes("/queue/data")) return answer;
+    const decoder = new TextDecoder();
+    const late = new TransformStream({
+        async transform(part, stream) {
+            if (decoder.decode(part).includes("close_stream"))
+                await new Promise((wake) => setTimeout(wake, 1000));
+            stream.enqueue(part);
+        },
+    });
+    return new Response(answer.body.pipeThrough(late), answer);
+};
+"""
 AT_WORK = re.compile("looking through the video|frame \\d")
 
 pytestmark = [pytest.mark.system, pytest.mark.needs_chromium]
@@ -303,6 +320,16 @@ def test_each_3_d_picture_opens_with_its_format_and_size(answered, kind, tmp_pat
         assert (picture.format, picture.size) == STILLS[kind]
         assert getattr(picture, "n_frames", 1) == FRAMES.get(kind, 1)
     assert answered.picture("preview").std() > 10
+
+
+def test_a_window_that_reads_the_end_of_a_stream_late_loses_no_results(browser, server, pair, tmp_path):
+    with visiting(browser, server[1], LATE_ENDS) as visit:
+        visit.give(**pair)
+        visit.page.get_by_label("fast").check()
+        visit.find()
+        visit.open("3-D picture")
+        for kind in ("depth_map", "rgbd", "side_by_side"):
+            make_picture(visit, kind, tmp_path)
 
 
 def test_all_kinds_of_3_d_pictures_are_tested():

@@ -17,12 +17,16 @@ PATIENCE_MS = 60_000
 
 
 class Visit:
-    """One visitor's window; `asked` are the URLs that it requested, `refused` those that failed."""
+    """One visitor's window; `asked` are the URLs that it requested, `refused` those that failed.
 
-    def __init__(self, browser: Browser, address: str) -> None:
+    The window runs `script` before the page's own scripts.
+    """
+
+    def __init__(self, browser: Browser, address: str, script: str = "") -> None:
         self.asked: list[str] = []
         self.refused: list[str] = []
         self._context = browser.new_context(viewport=WINDOW)
+        self._context.add_init_script(script)
         self.page = self._context.new_page()
         self.page.set_default_timeout(PATIENCE_MS)
         self.page.on("request", lambda request: self.asked.append(request.url))
@@ -100,8 +104,8 @@ class Visit:
 
 
 @contextmanager
-def visiting(browser: Any, address: str) -> Iterator[Visit]:
+def visiting(browser: Any, address: str, script: str = "") -> Iterator[Visit]:
     """Open the page in a window of its own, which closes at the end of the block."""
-    visit = Visit(browser, address)
+    visit = Visit(browser, address, script)
     yield visit
     visit.close()
