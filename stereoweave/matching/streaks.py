@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float32
 
@@ -29,9 +30,10 @@ def smooth_streaks(estimate: Estimate) -> Estimate:
 def _take_median_of_columns(
     disparity_px: Float32[np.ndarray, "h w"], where: Bool[np.ndarray, "h w"]
 ) -> Float32[np.ndarray, "h w"]:
-    rows, columns = np.nonzero(where)
-    around = rows[:, None] + np.arange(_ROWS) - _ROWS // 2
-    around = around.clip(0, len(disparity_px) - 1)
+    half = _ROWS // 2
+    extended_px = cv2.copyMakeBorder(disparity_px, half, half, 0, 0, cv2.BORDER_REPLICATE)
+    around_px = np.lib.stride_tricks.sliding_window_view(extended_px, _ROWS, axis=0)[where]
+    around_px.partition(half, axis=1)  # np.median takes seven times as long
     smoothed_px = disparity_px.copy()
-    smoothed_px[rows, columns] = np.median(disparity_px[around, columns[:, None]], axis=1)
+    smoothed_px[where] = around_px[:, half]
     return smoothed_px
