@@ -35,79 +35,71 @@ def fill_occluded(estimate: Estimate, left_seen: Bool[np.ndarray, "h w"] | None 
     """
     occluded = estimate.occluded
     visible = ~occluded if left_seen is None else ~occluded & left_seen
-    own_px, claimed = estimate.disparity_px[occluded], estimate.confidence[occluded]
-    disparity_px, confidence = estimate.disparity_px.copy(), estimate.confidence.copy()
-    disparity_px[~visible], confidence[~visible] = _background(estimate, visible)
-    filled_px, beside = cv2.medianBlur(disparity_px, _MEDIAN_PX)[occluded], confidence[occluded]
+    at = np.flatnonzero(occluded)
+    own_px, claimed = estimate.disparity_px.ravel()[at], estimate.confidence.ravel()[at]
+    row_px, beside = _fill_rows(np.stack([estimate.disparity_px, estimate.confidence]), visible)
+    filled_px = cv2.medianBlur(row_px, _MEDIAN_PX).ravel()[at]
     kept = np.abs(filled_px - own_px) > _FAR_OFF_PX
-    rows, columns = np.nonzero(occluded)
-    kept[kept] = _within_surroundings(estimate.disparity_px, visible, rows[kept], columns[kept])
-    np.copyto(disparity_px, estimate.disparity_px)
-    np.copyto(confidence, estimate.confidence)
+    kept[kept] = _within_surroundings(estimate.disparity_px, visible, at[kept])
+    believed = claimed + _SHARE_BESIDE * (beside.ravel()[at] - claimed)
+    disparity_px, confidence = estimate.disparity_px.copy(), estimate.confidence.copy()
     disparity_px[occluded] = np.where(kept, own_px, filled_px)
-    believed = claimed + _SHARE_BESIDE * (beside - claimed)
     confidence[occluded] = np.where(kept | (claimed == 0), claimed, believed)
     return replace(estimate, disparity_px=disparity_px, confidence=confidence)
 
 
-def _background(
-    estimate: Estimate, visible: Bool[np.ndarray, "h w"]
-) -> tuple[Float32[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
-    """Return the background's disparity and confidence for each invisible pixel, in row-major order.
+def _fill_rows(
+    maps: Float32[np.ndarray, "2 h w"], visible: Bool[np.ndarray, "h w"]
+) -> Float32[np.ndarray, "2 h w"]:
+    """Return disparity and confidence in which every invisible pixel has the values of the background.
 
     The background is the farther of the two surfaces at the ends of the pixel's run of invisible pixels. In a
-    row without visible pixels, each pixel keeps its own values.
+    row without visible pixels, each pixel keeps its own values. Overwrites `maps`.
     """
-    occluded = np.pad(~visible, ((0, 0), (1, 1)))
-    changes = np.flatnonzero(occluded.ravel()[1:] != occluded.ravel()[:-1])
-    rows, columns = np.divmod(changes.reshape(-1, 2), occluded.shape[1])
+    invisible = np.pad(~visible, ((0, 0), (1, 1)))
+    changes = np.flatnonzero(invisible.ravel()[1:] != invisible.ravel()[:-1])
+    rows, columns = np.divmod(changes.reshape(-1, 2), invisible.shape[1])
     steps = np.arange(_END_PX)
-    left, right = (rows[:, :1], columns[:, :1] - 1 - steps), (rows[:, 1:], columns[:, 1:] + steps)
-    left_px, right_px = (_medians(estimate.disparity_px, visible, *end) for end in (left, right))
-    left_confidence, right_confidence = (
-        _medians(estimate.confidence, visible, *end) for end in (left, right)
-    )
-    from_right = np.isnan(left_px) | (right_px < left_px)
-    lengths = np.diff(columns)[:, 0]
-    farther_px = np.repeat(np.where(from_right, right_px, left_px), lengths)
-    confidence = np.repeat(np.where(from_right, right_confidence, left_confidence), lengths)
-    alone = np.isnan(farther_px)
-    return (
-        np.where(alone, estimate.disparity_px[~visible], farther_px),
-        np.where(alone, estimate.confidence[~visible], confidence),
-    )
+    left = _medians(maps, visible, rows[:, :1], columns[:, :1] - 1 - steps)
+    right = _medians(maps, visible, rows[:, 1:], columns[:, 1:] + steps)
+    farther = np.where(np.isnan(left[0]) | (right[0] < left[0]), right, left)
+    background = np.repeat(farther, np.diff(columns)[:, 0], axis=1)
+    known = ~np.isnan(background[0])
+    maps.reshape(2, -1)[:, np.flatnonzero(~visible)[known]] = background[:, known]
+    return maps
 
 
 def _medians(
-    values: Float32[np.ndarray, "h w"],
+    maps: Float32[np.ndarray, "2 h w"],
     visible: Bool[np.ndarray, "h w"],
     rows: Int[np.ndarray, "n 1"],
     columns: Int[np.ndarray, "n k"],
-) -> Float32[np.ndarray, " n"]:
+) -> Float32[np.ndarray, "2 n"]:
     """Return the lower median of the visible pixels among K columns of each row; NaN if there are none.
 
     Row i of `columns` [N, K] belongs to `rows[i]`.
     """
-    last = values.shape[1] - 1
-    at = rows, columns.clip(0, last)
-    known = (columns >= 0) & (columns <= last) & visible[at]
-    ordered = np.sort(np.where(known, values[at], np.float32(np.nan)), axis=1)
+    width = maps.shape[2]
+    at = width * rows + columns.clip(0, width - 1)
+    known = (columns >= 0) & (columns < width) & visible.ravel()[at]
+    ordered = np.where(known, maps.reshape(2, -1).take(at, axis=1), np.float32(np.nan))
+    ordered.sort(axis=2)
     middle = np.maximum(known.sum(axis=1) - 1, 0) // 2
-    return ordered[np.arange(len(middle)), middle]
+    return ordered[:, np.arange(len(middle)), middle]
 
 
 def _within_surroundings(
     disparity_px: Float32[np.ndarray, "h w"],
     visible: Bool[np.ndarray, "h w"],
-    rows: Int[np.ndarray, " n"],
-    columns: Int[np.ndarray, " n"],
+    at: Int[np.ndarray, " n"],
 ) -> Bool[np.ndarray, " n"]:
-    """Return whether each pixel's disparity lies within the range of the visible disparities around it."""
+    """Return whether the disparity of each pixel, given by its index, is in the visible range around it."""
     some = np.s_[::_SPACING_PX, ::_SPACING_PX]
     known, some_px = visible[some], disparity_px[some]
     window = np.ones((_AROUND, _AROUND), np.uint8)
-    at = rows // _SPACING_PX, columns // _SPACING_PX
-    farthest_px = cv2.erode(np.where(known, some_px, np.float32(np.inf)), window)[at]
-    nearest_px = cv2.dilate(np.where(known, some_px, np.float32(-np.inf)), window)[at]
-    own_px = disparity_px[rows, columns]
+    rows, columns = np.divmod(at, disparity_px.shape[1])
+    place = rows // _SPACING_PX, columns // _SPACING_PX
+    farthest_px = cv2.erode(np.where(known, some_px, np.float32(np.inf)), window)[place]
+    nearest_px = cv2.dilate(np.where(known, some_px, np.float32(-np.inf)), window)[place]
+    own_px = disparity_px.ravel()[at]
     return (own_px >= farthest_px) & (own_px <= nearest_px)
