@@ -24,7 +24,6 @@ from stereoweave.learn.checkpoint import Checkpoint
 from stereoweave.learn.data.sources import PairSource, RenderedSet, cache_pairs, open_sources
 from stereoweave.learn.evaluation import make_method
 from stereoweave.learn.export.from_checkpoint import count_multiply_adds
-from stereoweave.learn.models import build_network
 from stereoweave.learn.recipe import COLLAGE, Recipe
 from stereoweave.learn.training.loop import train_recipe
 from stereoweave.learn.training.scores import validate
@@ -123,9 +122,7 @@ def run_ablations(
 
 
 def _make_row(trial: Trial, trained: Checkpoint, held_out: dict[str, PairSource]) -> dict[str, object]:
-    network = build_network(trained.recipe)
-    network.load_state_dict(trained.averaged)
-    network.eval()
+    network = trained.build_averaged()
     changes = VARIATIONS[trial.claim][trial.setting]
     scores = {
         f"{pairs}_{name}": value

@@ -45,6 +45,12 @@ class Checkpoint:
         """Return the origin of a run that starts from this checkpoint."""
         return *self.origin, {"recipe": asdict(self.recipe), "step": self.step, "commit": self.commit}
 
+    def build_averaged(self) -> Any:
+        """Return the network with the averaged weights, in inference mode."""
+        network = build_network(self.recipe)
+        network.load_state_dict(self.averaged)
+        return network.eval()
+
 
 def make_initial(recipe: Recipe, commit: str) -> Checkpoint:
     """Make the first checkpoint of a new run.

@@ -22,7 +22,7 @@ from stereoweave.learn.data.batches import collate, read_known
 from stereoweave.learn.data.sources import PairSource, cache_pairs, open_sources
 from stereoweave.learn.devices import choose_device
 from stereoweave.learn.mc_cnn_matcher import match_sample
-from stereoweave.learn.models import CodeNetwork, build_network
+from stereoweave.learn.models import CodeNetwork
 from stereoweave.learn.models.mc_cnn import MCCNN
 from stereoweave.learn.recipe import Recipe
 from stereoweave.learn.training.objective import CodeObjective
@@ -105,9 +105,7 @@ def make_method(trained: Checkpoint) -> DisparityMethod:
     The network runs on a GPU if there is one.
     """
     device = choose_device()
-    network = build_network(trained.recipe)
-    network.load_state_dict(trained.averaged)
-    network.eval().to(device)
+    network = trained.build_averaged().to(device)
     if isinstance(network, MCCNN):
         return partial(match_sample, network, int(trained.recipe.max_disparity_px))
 

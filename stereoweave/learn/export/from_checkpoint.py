@@ -19,7 +19,7 @@ from stereoweave.io.files import make_folder, replacing
 from stereoweave.learn import checkpoint
 from stereoweave.learn.checkpoint import Checkpoint
 from stereoweave.learn.export import confidence as calibrate
-from stereoweave.learn.models import CodeNetwork, build_network
+from stereoweave.learn.models import CodeNetwork
 from stereoweave.learn.models.ganet import GANet
 from stereoweave.learn.models.mc_cnn import MCCNN
 from stereoweave.learn.models.psmnet import PSMNet
@@ -97,9 +97,7 @@ def load_matcher_network(kept: Checkpoint) -> Any:
     Raises:
         StereoweaveError: The network estimates depth, or is a PSMNet, a GANet or an MC-CNN.
     """
-    network = build_network(kept.recipe)
-    network.load_state_dict(kept.averaged)
-    network.eval()
+    network = kept.build_averaged()
     if isinstance(network, MCCNN):
         raise StereoweaveError(
             f"{kept.recipe.name}: expected a network that estimates disparities, found mc_cnn, which "

@@ -14,7 +14,6 @@ from stereoweave.io.files import replacing
 from stereoweave.learn import checkpoint
 from stereoweave.learn.data.sources import cache_pairs, open_held_out_sets, open_sources
 from stereoweave.learn.devices import choose_device, describe_device
-from stereoweave.learn.models import build_network
 from stereoweave.learn.recipe import Recipe
 from stereoweave.learn.training.loop import SCORES_FILE, read_scores
 from stereoweave.learn.training.scores import validate, validate_sets
@@ -87,9 +86,7 @@ def record_timed_run(run: Path, recipe: Recipe, out: Path, console: Console) -> 
     _, held_out = open_sources(replace(recipe, mix=()), run.parent / "pairs")  # no training sets are needed
     sets, device = open_held_out_sets(recipe), choose_device()
     cache_pairs(held_out, console)
-    network = build_network(kept.recipe)
-    network.load_state_dict(kept.averaged)
-    network.to(device).eval()
+    network = kept.build_averaged().to(device)
     scores = validate(network, held_out, device) | validate_sets(network, sets, device)
     row = _make_row(run, progress.pairs, {"step": progress.steps, **scores}, kept.commit)
     others = [one for one in _read(out) if (one["recipe"], one["step"]) != (run.name, str(progress.steps))]

@@ -15,7 +15,6 @@ from torch import Tensor
 
 from stereoweave.errors import FormatError
 from stereoweave.learn import checkpoint
-from stereoweave.learn.models import build_network
 from stereoweave.learn.models.weave import WeaveNet, WeaveStages
 
 
@@ -44,11 +43,10 @@ class Teacher:
     def __init__(self, path: Path) -> None:
         kept = checkpoint.load(path)
         with torch.device("cpu"):  # recipes are checked on the device "meta"
-            network = build_network(kept.recipe)
+            network = kept.build_averaged()
         if not isinstance(network, WeaveNet):
             raise FormatError(f"{path}: expected a WeaveNet as teacher, found {kept.recipe.model}")
-        network.load_state_dict(kept.averaged)
-        self.network = network.eval().requires_grad_(False)
+        self.network = network.requires_grad_(False)
 
     def teach(self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]) -> Lesson:
         """Return the teacher's results for a batch."""
