@@ -19,7 +19,6 @@ from stereoweave.io.images import read_image
 from stereoweave.learn import checkpoint
 from stereoweave.learn.data.collage import paint_collage
 from stereoweave.learn.export.from_checkpoint import compare_runtimes
-from stereoweave.learn.models import build_network
 from stereoweave.learn.models.layers import local_soft_argmax
 from stereoweave.matching.estimate import match
 from stereoweave.matching.matcher import Matcher, shipped_models
@@ -147,7 +146,4 @@ def test_on_real_pairs_the_shipped_file_matches_its_checkpoint_in_pytorch(testda
 
 
 def trained(name):
-    kept = checkpoint.load(ROOT / "checkpoints" / f"{name}.pt")
-    network = build_network(kept.recipe)
-    network.load_state_dict(kept.averaged)
-    return network.eval()
+    return checkpoint.load(ROOT / "checkpoints" / f"{name}.pt").build_averaged()
