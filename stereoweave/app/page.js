@@ -1,6 +1,7 @@
 // Gradio cannot cancel an event before the server has answered its request to join the queue.
 const joins = new Set();
 const load = window.fetch;
+const wait = (ms) => new Promise((wake) => setTimeout(wake, ms));
 
 window.fetch = (...given) => {
     const answer = load(...given);
@@ -12,10 +13,9 @@ window.fetch = (...given) => {
     return answer;
 };
 
-// Resolves when all requests are answered, also those about to be sent.
+// Resolves when the requests made until now are answered, and the answers are read; after 10 s at the latest.
 window.joinsAnswered = async () => {
-    do {
-        await Promise.allSettled(joins);
-        await new Promise((wake) => setTimeout(wake, 100));
-    } while (joins.size);
+    await wait(100); // the events of a click join one after the other
+    await Promise.race([Promise.allSettled(joins), wait(10_000)]);
+    await wait(100);
 };

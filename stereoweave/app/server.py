@@ -52,7 +52,7 @@ def make_server(host: Host, names: Sequence[str] | None) -> FastAPI:
         mcp_server=False,
         theme=_make_theme(),
         css=css,
-        head=f"{_NARROW}<script>{{{script}}}</script>",
+        head=f"{_NARROW}<script>{{ {script} }}</script>",  # a block, so that the page keeps its own names
     )
     server.add_middleware(OwnFiles)
     server.add_middleware(EndedStreams)

@@ -1,4 +1,4 @@
-"""Middleware that keeps new events of the page apart from a stream of results that is about to end."""
+"""Middleware that delays new events until the window has read the end of its stream of results."""
 
 import asyncio
 from collections import defaultdict
@@ -9,39 +9,42 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from stereoweave.app.access import API, find_visitor
 
 _STREAM, _JOIN = f"{API}/queue/data", f"{API}/queue/join"
-_END = b'"close_stream"'
-# Far longer than messages travel. Behind a proxy that hides disconnections, every end takes this long.
-_PATIENCE_S = 5.0
+_END = b'data: {"msg":"close_stream"'
+# Longer than any message takes. Behind a proxy that hides disconnections, each stream stays open this long
+# after its end.
+_PATIENCE_S = 2.0
 
 
 class EndedStreams:
-    """Middleware that answers a new event only after the window has read the end of its earlier stream.
+    """Middleware that answers a visitor's new event only after the end of the stream before it is read.
 
     Gradio streams the results of a window's events, and ends the stream when no event is left. A window that
     starts an event before it has read this end opens no new stream, so it would wait forever. A window that
-    has read the end disconnects.
+    has read the end disconnects. Visitors are told apart by `OwnFiles`' cookie; without it, nothing is
+    delayed.
     """
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
-        # Of each visitor, the ends that are sent and not read yet.
+        # Unread ends of streams, by visitor.
         self._unread: defaultdict[str, set[asyncio.Event]] = defaultdict(set)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         path = scope.get("path")
-        if path == _STREAM:
-            await self._stream(scope, receive, send)
-        elif path == _JOIN:
-            await self._app(scope, receive, self._wait_for_ends(send, find_visitor(scope)))
+        visitor = find_visitor(scope) if path in (_STREAM, _JOIN) else ""
+        if visitor and path == _STREAM:
+            await self._stream(visitor, scope, receive, send)
+        elif visitor:
+            await self._app(scope, receive, self._wait_for_ends(send, visitor))
         else:
             await self._app(scope, receive, send)
 
-    async def _stream(self, scope: Scope, receive: Receive, send: Send) -> None:
+    async def _stream(self, visitor: str, scope: Scope, receive: Receive, send: Send) -> None:
         """Stream results, and keep the connection after their end until the window disconnects."""
-        visitor, is_read = find_visitor(scope), asyncio.Event()
+        is_read = asyncio.Event()
 
         async def send_and_watch(message: Message) -> None:
-            if _END in message.get("body", b""):
+            if message.get("body", b"").startswith(_END):
                 self._unread[visitor].add(is_read)
             elif is_read in self._unread[visitor]:
                 await _wait_for_disconnection(receive)
@@ -59,8 +62,10 @@ class EndedStreams:
         """Return a `send` that first waits until the visitor's windows have read all ends."""
 
         async def wait_and_send(message: Message) -> None:
-            for is_read in list(self._unread.get(visitor, ())):
-                await is_read.wait()
+            if unread := self._unread.get(visitor):
+                with suppress(TimeoutError):
+                    async with asyncio.timeout(_PATIENCE_S):
+                        await asyncio.gather(*(is_read.wait() for is_read in unread))
             await send(message)
 
         return wait_and_send

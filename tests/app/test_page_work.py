@@ -39,15 +39,17 @@ const load = window.fetch;
 window.fetch = async (...given) => {
     const answer = await load(...given);
     if (!String(given[0].url ?? given[0]).includes("/queue/data")) return answer;
-    const decoder = new TextDecoder();
     const late = new TransformStream({
-        async transform(part, stream) {
-            if (decoder.decode(part).includes("close_stream"))
-                await new Promise((wake) => setTimeout(wake, 1000));
-            stream.enqueue(part);
+        async transform(text, stream) {
+            const end = text.indexOf('data: {"msg":"close_stream"');
+            stream.enqueue(end < 0 ? text : text.slice(0, end));
+            if (end < 0) return;
+            await new Promise((wake) => setTimeout(wake, 1000));
+            stream.enqueue(text.slice(end));
         },
     });
-    return new Response(answer.body.pipeThrough(late), answer);
+    const body = answer.body.pipeThrough(new TextDecoderStream()).pipeThrough(late);
+    return new Response(body.pipeThrough(new TextEncoderStream()), answer);
 };
 """
 AT_WORK = re.compile("looking through the video|frame \\d")
