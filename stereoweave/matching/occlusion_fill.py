@@ -35,27 +35,26 @@ def fill_occluded(estimate: Estimate, left_seen: Bool[np.ndarray, "h w"] | None 
     """
     occluded = estimate.occluded
     visible = ~occluded if left_seen is None else ~occluded & left_seen
-    at = np.flatnonzero(occluded)
-    own_px, claimed = estimate.disparity_px.ravel()[at], estimate.confidence.ravel()[at]
-    row_px, beside = _fill_rows(np.stack([estimate.disparity_px, estimate.confidence]), visible)
-    filled_px = cv2.medianBlur(row_px, _MEDIAN_PX).ravel()[at]
+    flat = np.flatnonzero(occluded)
+    own_px, claimed = estimate.disparity_px.ravel()[flat], estimate.confidence.ravel()[flat]
+    row_px, beside = _fill_rows(estimate, visible)
+    filled_px = cv2.medianBlur(row_px, _MEDIAN_PX).ravel()[flat]
     kept = np.abs(filled_px - own_px) > _FAR_OFF_PX
-    kept[kept] = _within_surroundings(estimate.disparity_px, visible, at[kept])
-    believed = claimed + _SHARE_BESIDE * (beside.ravel()[at] - claimed)
+    kept[kept] = _within_surroundings(estimate.disparity_px, visible, flat[kept])
+    believed = claimed + _SHARE_BESIDE * (beside.ravel()[flat] - claimed)
     disparity_px, confidence = estimate.disparity_px.copy(), estimate.confidence.copy()
     disparity_px[occluded] = np.where(kept, own_px, filled_px)
     confidence[occluded] = np.where(kept | (claimed == 0), claimed, believed)
     return replace(estimate, disparity_px=disparity_px, confidence=confidence)
 
 
-def _fill_rows(
-    maps: Float32[np.ndarray, "2 h w"], visible: Bool[np.ndarray, "h w"]
-) -> Float32[np.ndarray, "2 h w"]:
+def _fill_rows(estimate: Estimate, visible: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "2 h w"]:
     """Return disparity and confidence in which every invisible pixel has the values of the background.
 
     The background is the farther of the two surfaces at the ends of the pixel's run of invisible pixels. In a
-    row without visible pixels, each pixel keeps its own values. Overwrites `maps`.
+    row without visible pixels, each pixel keeps its own values.
     """
+    maps = np.stack([estimate.disparity_px, estimate.confidence])
     invisible = np.pad(~visible, ((0, 0), (1, 1)))
     changes = np.flatnonzero(invisible.ravel()[1:] != invisible.ravel()[:-1])
     rows, columns = np.divmod(changes.reshape(-1, 2), invisible.shape[1])
@@ -91,15 +90,18 @@ def _medians(
 def _within_surroundings(
     disparity_px: Float32[np.ndarray, "h w"],
     visible: Bool[np.ndarray, "h w"],
-    at: Int[np.ndarray, " n"],
+    flat: Int[np.ndarray, " n"],
 ) -> Bool[np.ndarray, " n"]:
-    """Return whether the disparity of each pixel, given by its index, is in the visible range around it."""
+    """Return whether each pixel's disparity is in the range of the visible disparities around it.
+
+    `flat` holds the pixels' indices in row-major order.
+    """
     some = np.s_[::_SPACING_PX, ::_SPACING_PX]
     known, some_px = visible[some], disparity_px[some]
     window = np.ones((_AROUND, _AROUND), np.uint8)
-    rows, columns = np.divmod(at, disparity_px.shape[1])
-    place = rows // _SPACING_PX, columns // _SPACING_PX
-    farthest_px = cv2.erode(np.where(known, some_px, np.float32(np.inf)), window)[place]
-    nearest_px = cv2.dilate(np.where(known, some_px, np.float32(-np.inf)), window)[place]
-    own_px = disparity_px.ravel()[at]
+    rows, columns = np.divmod(flat, disparity_px.shape[1])
+    cell = rows // _SPACING_PX, columns // _SPACING_PX
+    farthest_px = cv2.erode(np.where(known, some_px, np.float32(np.inf)), window)[cell]
+    nearest_px = cv2.dilate(np.where(known, some_px, np.float32(-np.inf)), window)[cell]
+    own_px = disparity_px.ravel()[flat]
     return (own_px >= farthest_px) & (own_px <= nearest_px)
