@@ -33,6 +33,9 @@ _STAGES = {
     "weights": "upsampling",
     "to_match_half": "matching at 1/2",
     "to_half": "refinement",
+    "stem": "encoder",
+    "to_match_stem": "matching at 1/2",
+    "enlargement": "refinement",
 }
 # Stages of operations between the parts of a module, by that module ("" for the network itself) and by the
 # part of the network that ran last.

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Renders the sets of base_mix.toml in runs/; resumes. First argument: number of processes.
+# Renders the sets of base_mix.toml and small.toml in runs/; resumes. First argument: number of processes.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 make() { python3 -m stereoweave synth make "$@" --jobs "$jobs"; }

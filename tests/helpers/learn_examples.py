@@ -188,6 +188,12 @@ def mean_error_px(network, batch) -> float:
     return float((found_px - batch["disparity_px"]).abs().mean())
 
 
+def list_maps(stages) -> list[torch.Tensor]:
+    """List the maps of a WeaveNet's results."""
+    *maps, logits = vars(stages).values()
+    return [*maps, *logits]
+
+
 def write(recipe, file):
     """Write the recipe to the file and return the file's path."""
     lines = (f"{name} = {json.dumps(value)}" for name, value in asdict(recipe).items())

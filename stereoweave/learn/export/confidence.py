@@ -30,7 +30,7 @@ def calibrate_confidence(network: WeaveNet) -> dict[str, Any]:
     """
     scale, shift = _fit_scale_and_shift(*_predict_claims(network, _FIT_SEED))
     with torch.no_grad():
-        layer = network.refinement.confidence
+        layer = network.refinements[-1].confidence
         assert layer.bias is not None
         layer.weight *= scale
         layer.bias.mul_(scale).add_(shift)

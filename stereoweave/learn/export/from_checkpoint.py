@@ -217,11 +217,11 @@ def count_multiply_adds(network: nn.Module, height: int = 480, width: int = 640)
     counted = counter.get_total_flops() // 2
     if not isinstance(network, WeaveNet):
         return counted
-    # The counter covers only convolutions and matrix products, but the refinement correlates both views by
-    # elementwise products. Without warping, it interpolates between products, so it needs one more product
-    # than it has matches.
-    nearby = 2 * network.refinement.radius + 1 + (not network.size.warps)
-    return counted + 2 * (height // 2) * (width // 2) * network.size.compared * nearby
+    pixels = 2 * height * width  # of both views
+    # The last refinement is at 1/2 resolution, and each one before it at half that of the next.
+    scales = (4**i for i in range(len(network.refinements), 0, -1))
+    matches = (one.products * pixels // scale for one, scale in zip(network.refinements, scales, strict=True))
+    return counted + sum(matches)
 
 
 def _make_card(kept: Checkpoint, network: nn.Module) -> dict[str, Any]:

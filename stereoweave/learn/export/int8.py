@@ -32,9 +32,9 @@ _RANGES_PAIRS, _PROOF_PAIRS = 6, 24
 _SIZE = (320, 512)
 # Percentile of a map's values that the quantisation range covers. Outliers are clipped to keep steps small.
 _RANGE_PERCENTILE = 99.99
-# The refinement's layers stay in float32, because they resolve fractions of a pixel. In 8 bits they would
+# The refinements' layers stay in float32, because they resolve fractions of a pixel. In 8 bits they would
 # double the loss of accuracy.
-_KEPT = "refinement."
+_KEPT = ("refinement.", "enlargement.")
 
 
 def quantise(source: Path, out: Path) -> dict[str, Any]:

@@ -15,12 +15,14 @@ from stereoweave.learn.models.mc_cnn import MCCNN
 from stereoweave.learn.models.psmnet import PSMNet
 from stereoweave.learn.models.scvnet import SCVNet
 from stereoweave.learn.models.weave import BASE, BASE_GROWN, SMALL, WeaveNet
+from stereoweave.learn.models.weave_half import WeaveHalfNet
 from stereoweave.learn.recipe import Recipe
 
 MODELS: dict[str, Callable[..., Any]] = {
     "weave_small": partial(WeaveNet, SMALL),
     "weave_base": partial(WeaveNet, BASE),
     "weave_base_grown": partial(WeaveNet, BASE_GROWN),
+    "weave_half": WeaveHalfNet,
     "fast_depth": FastDepthNet,
     "fast_depth_without_skips": partial(FastDepthNet, skips=False),
     "densemapnet": DenseMapNet,

@@ -120,14 +120,14 @@ class WeaveStages:
 
     Attributes:
         correlation: Matching scores before aggregation, at 1/4 resolution, for each level of 4 px
-            [2B, D, H/4, W/4].
+            [2B, D, H/4, W/4]. In a `WeaveHalfNet` both numbers are 8.
         scores: Matching scores after aggregation, in the same format.
         coarse_px: Disparity before the refinement, at half resolution but in full-resolution pixels
             [2B, 1, H/2, W/2].
         disparity_px: Final disparity [2B, 1, H, W].
         confidence_logit: Log odds that the disparity is within 1 px of the truth [2B, 1, H, W].
-        coarse_logits: Logits of the weights that upsample the disparity to 1/2 resolution [2B, K, H/4, W/4].
-        fine_logits: Logits of the weights that upsample it to full resolution [2B, K, H/2, W/2].
+        upsampling_logits: Logits of the weights of each upsampling: to 1/2 resolution [2B, K, H/4, W/4], and
+            to full resolution [2B, K, H/2, W/2].
     """
 
     correlation: Float[Tensor, "b d h_d w_d"]
@@ -135,8 +135,7 @@ class WeaveStages:
     coarse_px: Float[Tensor, "b 1 h2 w2"]
     disparity_px: Float[Tensor, "b 1 h w"]
     confidence_logit: Float[Tensor, "b 1 h w"]
-    coarse_logits: Float[Tensor, "b kc h4 w4"]
-    fine_logits: Float[Tensor, "b kf h2 w2"]
+    upsampling_logits: tuple[Tensor, ...]
 
 
 class WeaveFeatures(NamedTuple):
@@ -266,6 +265,9 @@ class Refinement(nn.Module):
         self.radius = radius
         self.matches = correlate_warped if size.warps else correlate_nearby
         nearby = 2 * radius + 1
+        # Multiply-adds of a pixel's matches, which are elementwise products. Without warping, they are
+        # interpolated between one product more.
+        self.products = size.compared * (nearby if size.warps else nearby + 1)
         self.join = ConvBlock(nearby + size.channels[0] + size.handed, 16, kernel=1)
         self.body = nn.Sequential(*stack_convolutions(16, size.refinement))
         self.scores = nn.Conv2d(16, nearby, 1)
@@ -314,6 +316,11 @@ class WeaveNet(nn.Module):
     def max_disparity_px(self) -> int:
         return 4 * self.levels
 
+    @property
+    def refinements(self) -> tuple[Refinement, ...]:
+        """The refinements by matching, in order."""
+        return (self.refinement,)
+
     def stages(self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]) -> WeaveStages:
         """Return the results of every stage for both views."""
         # Here and below, len() and chunk() are avoided, because they would fix the batch size on export.
@@ -341,8 +348,7 @@ class WeaveNet(nn.Module):
             coarse_px=coarse * 2,
             disparity_px=self.upsample(fine * 2, fine_logits.float()),
             confidence_logit=confidence.float(),
-            coarse_logits=coarse_logits,
-            fine_logits=fine_logits.float(),
+            upsampling_logits=(coarse_logits, fine_logits.float()),
         )
 
     def match(self, maps: WeaveFeatures, first: WeaveFeatures) -> tuple[Tensor, Tensor, Tensor]:

@@ -57,7 +57,7 @@ def weave_losses(
         "coarse": 0.5 * compare(stages.coarse_px, halve(ahead_px)),
         "disparity": compare(stages.disparity_px, ahead_px),
         "confidence": 0.3 * confidence_loss(stages.confidence_logit, stages.disparity_px, truth_px),
-        "logits": 0.02 * (excess_loss(stages.coarse_logits) + excess_loss(stages.fine_logits)),
+        "logits": 0.02 * torch.stack([excess_loss(logits) for logits in stages.upsampling_logits]).sum(),
     }
 
 

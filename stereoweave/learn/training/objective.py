@@ -96,15 +96,15 @@ def build_objective(recipe: Recipe, network: nn.Module) -> Objective:
     return CodeObjective(recipe, network)
 
 
-def _load_teacher(recipe: Recipe, network: nn.Module) -> Teacher | None:
+def _load_teacher(recipe: Recipe, network: WeaveNet) -> Teacher | None:
     """Load a recipe's teacher, if it has one. Raises FormatError if it does not fit the network or crops."""
     if not recipe.teacher:
         return None
     teacher = Teacher(Path(recipe.teacher))
-    if teacher.network.levels != network.levels:
+    own, others = (f"{one.levels} levels to {one.max_disparity_px} px" for one in (network, teacher.network))
+    if others != own:
         raise FormatError(
-            f"{recipe.name}: teacher: expected {network.levels} levels as in {recipe.model}, found "
-            f"{teacher.network.levels} in {recipe.teacher}"
+            f"{recipe.name}: teacher: expected {own} as in {recipe.model}, found {others} in {recipe.teacher}"
         )
     if any(side % teacher.network.multiple_of for side in recipe.crop_size):
         raise FormatError(

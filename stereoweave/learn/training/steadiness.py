@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from stereoweave.learn.models.weave import WeaveNet, WeaveStages
+from stereoweave.learn.models.weave import Refinement, WeaveNet, WeaveStages
 
-# Disturbance of the disparity before the refinement, in half-resolution pixels, and of the disparity (in
+# Disturbance of the disparity before a refinement, in pixels of its maps, and of the disparity (in
 # levels) and the features after the aggregation: far above float32's rounding, and too small to move a match.
 _COARSE_DISTURBANCE_PX, _QUARTER_DISTURBANCE = 0.05, 0.01
 # Logits may change by this much per unit of the disturbance.
@@ -26,16 +26,18 @@ def predict_with_amplification(
 ) -> tuple[WeaveStages, Float[Tensor, ""]]:
     """Return the results of every stage, and the mean squared excess of the logits' slopes over 1.
 
-    A slope is a logit's change, divided by the disturbance of the disparity before the refinement, and for
-    the first upsampling of what leaves the aggregation. The excess is summed over both upsamplings. It is
-    computed in float32, since bfloat16 would round the changes away. The logits of the first upsampling count
-    only if the network has a completion.
+    A slope is a logit's change, divided by the disturbance of the disparity before a refinement, and for the
+    first upsampling of what leaves the aggregation. The excess is summed over all upsamplings. It is computed
+    in float32, since bfloat16 would round the changes away. The logits of the first upsampling count only if
+    the network has a completion.
     """
-    watched = [module for module in (network.refinement, network.completion) if module is not None]
+    watched = [*network.refinements, *([network.completion] if network.completion is not None else [])]
     with _record_inputs(watched) as inputs:
         stages = network.stages(left, right)
     with torch.autocast(left.device.type, enabled=False), _keep_statistics(network):
-        excess = _measure_fine(network, *(x.float() for x in inputs[network.refinement]))
+        excess = torch.zeros((), device=left.device)
+        for refinement in network.refinements:
+            excess = excess + _measure_fine(refinement, *(x.float() for x in inputs[refinement]))
         if network.completion is not None:
             excess = excess + _measure_coarse(network, *(x.float() for x in inputs[network.completion]))
     return stages, excess
@@ -71,9 +73,9 @@ def _keep_statistics(network: nn.Module) -> Iterator[None]:
             norm.track_running_stats = True
 
 
-def _measure_fine(network: WeaveNet, disparity: Tensor, *others: Tensor) -> Tensor:
+def _measure_fine(refinement: Refinement, disparity: Tensor, *others: Tensor) -> Tensor:
     def compute_logits(disparity: Tensor) -> Tensor:
-        _, logits, _ = network.refinement(disparity, *others)
+        _, logits, _ = refinement(disparity, *others)
         return logits
 
     moved = disparity + _COARSE_DISTURBANCE_PX * torch.randn_like(disparity).sign()

@@ -48,8 +48,9 @@ def test_reliability_of_honest_claims_has_no_error():
 
 
 @pytest.mark.usefixtures("few_small_pairs")
-def test_calibration_scales_and_shifts_the_confidence_and_leaves_the_disparity():
-    network = overfitted().network
+@pytest.mark.parametrize("name", ["weave_small", "weave_half"])
+def test_calibration_scales_and_shifts_the_confidence_and_leaves_the_disparity(name):
+    network = overfitted(name).network
     calibrated = copy.deepcopy(network)
     proof = calibrate.calibrate_confidence(calibrated)
     assert 0 <= proof["calibration_error"] <= 1

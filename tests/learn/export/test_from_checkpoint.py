@@ -46,6 +46,18 @@ def pair():
     return StereoPair(left=sample.left, right=sample.right)
 
 
+def test_a_network_at_half_the_resolution_answers_as_in_pytorch(tmp_path):
+    trained = overfitted("weave_half")
+    checkpoint.save(checkpoint_of(trained.network, recipe_of("weave_half")), tmp_path / "last.pt")
+    card = export.export_matcher(tmp_path, tmp_path / "half.onnx")
+    assert card["onnx_differs_px"] < 0.01
+    matcher = Matcher(tmp_path / "half.onnx")
+    assert (matcher.multiple_of, matcher.max_disparity_px) == (32, 384)
+    # Also for a size that needs padding.
+    left, right = (np.resize(view, (75, 130, 3)) for view in (trained.sample.left, trained.sample.right))
+    assert matcher.estimate(left, right).disparity_px.shape == (75, 130)
+
+
 def of_another_network(graph):
     """Return the graph with negated weights in one of its layers."""
     weights = next(value for value in graph.graph.initializer if len(value.dims) == 4)

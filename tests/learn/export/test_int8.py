@@ -43,9 +43,10 @@ def test_only_convolutions_and_nodes_between_them_take_8_bits():
         node("Add", ["g", "image"], "h"),  # no convolution reads it
         node("Concat", ["h", "g"], "i"),  # read by a convolution that stays in float32
         conv("i", "refinement.join.weight", "j"),
+        conv("j", "enlargement.join.weight", "k"),
     ]
     image = helper.make_tensor_value_info("image", TensorProto.FLOAT, None)
-    last = helper.make_tensor_value_info("j", TensorProto.FLOAT, None)
+    last = helper.make_tensor_value_info("k", TensorProto.FLOAT, None)
     graph = helper.make_model(helper.make_graph(nodes, "graph", [image], [last]))
     assert quantise.select_int8_nodes(graph) == [
         "conv_a", "Relu_b", "conv_c", "Add_d", "Concat_e", "conv_f", "Relu_g",

@@ -17,6 +17,7 @@ PARAMETERS = {
     "weave_small": 278_029,
     "weave_base": 1_274_290,
     "weave_base_grown": 1_466_405,
+    "weave_half": 743_042,
     "fast_depth": 314_722,
     "fast_depth_without_skips": 301_858,
     "densemapnet": 290_290,
@@ -157,6 +158,7 @@ def test_the_error_for_an_unknown_network_lists_the_known_ones():
     with pytest.raises(FormatError) as caught:
         build_network(recipe_of("spider"))
     assert str(caught.value) == (
-        "tiny: model = 'spider', expected one of weave_small, weave_base, weave_base_grown, fast_depth, "
-        "fast_depth_without_skips, densemapnet, dispnet, psmnet, mc_cnn, scvnet, ganet_11, ganet_deep"
+        "tiny: model = 'spider', expected one of weave_small, weave_base, weave_base_grown, weave_half, "
+        "fast_depth, fast_depth_without_skips, densemapnet, dispnet, psmnet, mc_cnn, scvnet, ganet_11, "
+        "ganet_deep"
     )

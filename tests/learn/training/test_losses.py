@@ -2,6 +2,7 @@ import math
 
 import pytest
 import torch
+from learn_examples import list_maps
 
 from stereoweave.learn.models.weave import WeaveStages
 from stereoweave.learn.training.losses import (
@@ -30,10 +31,14 @@ def stages(height=8, width=16, logit=0.0):
         "coarse_px": torch.full((2, 1, height // 2, width // 2), 5.0),
         "disparity_px": torch.full((2, 1, height, width), 5.0),
         "confidence_logit": torch.zeros(2, 1, height, width),
-        "coarse_logits": torch.full((2, 36, height // 4, width // 4), logit),
-        "fine_logits": torch.full((2, 36, height // 2, width // 2), logit),
+        "upsampling_logits": tuple(
+            torch.full((2, 36, height // scale, width // scale), logit) for scale in (4, 2)
+        ),
     }
-    return WeaveStages(**{name: values.requires_grad_() for name, values in maps.items()})
+    found = WeaveStages(**maps)
+    for values in list_maps(found):
+        values.requires_grad_()
+    return found
 
 
 def flat_truth(value_px, height=8, width=16):
@@ -107,14 +112,15 @@ def test_the_terms_of_an_uninformed_prediction():
 
 def test_upsampling_logits_beyond_8_cost_their_mean_excess():
     predicted = stages()
+    coarse, fine = predicted.upsampling_logits
     with torch.no_grad():
-        predicted.coarse_logits[:, :18], predicted.coarse_logits[:, 18:] = -28.0, 7.9
-        predicted.fine_logits[:, 0] = 80.0
+        coarse[:, :18], coarse[:, 18:] = -28.0, 7.9
+        fine[:, 0] = 80.0
     term = weave_losses(predicted, *flat_truth(5.0))["logits"]
     assert term.item() == pytest.approx(0.02 * (20 / 2 + 72 / 36))
     term.backward()
-    assert predicted.coarse_logits.grad[:, :18].lt(0).all()
-    assert not predicted.coarse_logits.grad[:, 18:].any()
+    assert coarse.grad[:, :18].lt(0).all()
+    assert not coarse.grad[:, 18:].any()
 
 
 def test_unknown_truth_gives_no_nan_gradient_and_does_not_count():
@@ -123,7 +129,7 @@ def test_unknown_truth_gives_no_nan_gradient_and_does_not_count():
     truth_px[:, :, 2:7, 3:11] = NAN
     terms = weave_losses(predicted, truth_px, occluded)
     torch.stack(list(terms.values())).sum().backward()
-    for values in vars(predicted).values():
+    for values in list_maps(predicted):
         assert values.grad.isfinite().all()
         assert values.grad.any()
     assert not predicted.disparity_px.grad[:, :, 2:7, 3:11].any()
@@ -136,7 +142,7 @@ def test_truth_that_is_all_unknown_has_no_loss():
     total = torch.stack(list(weave_losses(predicted, truth_px, occluded).values())).sum()
     total.backward()
     assert total.item() == 0
-    assert not any(values.grad.any() for values in vars(predicted).values())
+    assert not any(values.grad.any() for values in list_maps(predicted))
 
 
 def test_occluded_pixels_do_not_touch_the_correlation_term():

@@ -6,6 +6,7 @@ from learn_examples import RECIPE, untrained
 from torch import nn
 
 from stereoweave.learn.models import build_network
+from stereoweave.learn.models.weave import SMALL, Refinement
 from stereoweave.learn.training.objective import WeaveObjective
 from stereoweave.learn.training.steadiness import predict_with_amplification
 
@@ -20,11 +21,11 @@ def amplification(network):
     return predict_with_amplification(network, *views())[1].item()
 
 
-class Sloped(nn.Module):
+class Sloped(Refinement):
     """Refinement whose logits are all `slope` times the disparity, in half-resolution pixels."""
 
     def __init__(self, slope):
-        super().__init__()
+        super().__init__(SMALL)
         self.slope = slope
 
     def forward(self, disparity, *_):
@@ -36,6 +37,17 @@ def test_the_amplification_is_the_square_of_a_logit_s_slope_beyond_1(slope, expe
     network = untrained("weave_small")
     network.refinement = Sloped(slope)
     assert amplification(network) == pytest.approx(expected, rel=1e-4, abs=1e-4)
+
+
+@pytest.mark.parametrize("part", ["refinement", "enlargement"])
+def test_the_amplification_of_both_refinements_of_a_network_at_half_the_resolution_counts(part):
+    network = untrained("weave_half")
+    for refinement in network.refinements:
+        nn.init.zeros_(refinement.weights.weight)
+    nn.init.zeros_(network.weights.weight)
+    assert amplification(network) == 0
+    nn.init.constant_(getattr(network, part).weights.weight, 1000.0)
+    assert amplification(network) > 1
 
 
 def test_the_amplification_before_the_first_upsampling_counts_too():
@@ -54,7 +66,7 @@ def test_the_stages_are_those_of_a_prediction_without_the_amplification():
     assert torch.equal(stages.disparity_px, network.stages(*views()).disparity_px)
 
 
-@pytest.mark.parametrize("name", ["weave_small", "weave_base_grown"])
+@pytest.mark.parametrize("name", ["weave_small", "weave_base_grown", "weave_half"])
 def test_batch_norms_record_one_pass(name):
     plain, measured = untrained(name).train(), untrained(name).train()
     plain.stages(*views())

@@ -78,7 +78,11 @@ def test_a_teacher_of_another_kind_or_with_other_levels_is_named(tmp_path):
     assert message == f"{path}: expected a WeaveNet as teacher, found fast_depth"
     path = str(write_teacher(tmp_path))
     message = complaint(build_objective, replace(RECIPE, teacher=path), WeaveNet(levels=24))
-    assert message == f"tiny: teacher: expected 24 levels as in weave_small, found 48 in {path}"
+    found = f"found 48 levels to 192 px in {path}"
+    assert message == f"tiny: teacher: expected 24 levels to 96 px as in weave_small, {found}"
+    recipe = recipe_of("weave_half", teacher=path)
+    message = complaint(build_objective, recipe, untrained("weave_half"))
+    assert message == f"tiny: teacher: expected 48 levels to 384 px as in weave_half, {found}"
 
 
 def test_crops_must_fit_the_teacher(tmp_path):

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from learn_examples import RECIPE, untrained
+from learn_examples import RECIPE, list_maps, untrained
 
 from stereoweave.learn.models.weave import WeaveStages
 from stereoweave.learn.training.losses import regression_loss, weave_losses
@@ -21,10 +21,14 @@ def prediction(estimate_px=5.0, level_px=4, height=16, width=32):
         "coarse_px": torch.full((2, 1, height // 2, width // 2), estimate_px),
         "disparity_px": torch.full((2, 1, height, width), estimate_px),
         "confidence_logit": torch.zeros(2, 1, height, width),
-        "coarse_logits": torch.full((2, 36, height // level_px, width // level_px), 9.0),
-        "fine_logits": torch.full((2, 36, height // 2, width // 2), 9.0),
+        "upsampling_logits": tuple(
+            torch.full((2, 36, height // scale, width // scale), 9.0) for scale in (level_px, 2)
+        ),
     }
-    return WeaveStages(**{name: values.requires_grad_() for name, values in maps.items()})
+    found = WeaveStages(**maps)
+    for values in list_maps(found):
+        values.requires_grad_()
+    return found
 
 
 def batch_of(truth_px, height=16, width=32):
