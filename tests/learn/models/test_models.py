@@ -17,7 +17,7 @@ PARAMETERS = {
     "weave_small": 278_029,
     "weave_base": 1_274_290,
     "weave_base_grown": 1_466_405,
-    "weave_half": 743_042,
+    "weave_half": 761_602,
     "fast_depth": 314_722,
     "fast_depth_without_skips": 301_858,
     "densemapnet": 290_290,
