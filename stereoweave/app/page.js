@@ -1,4 +1,4 @@
-// Gradio cannot cancel an event before the server has answered its request to join the queue.
+// Gradio cannot cancel an event before it has read the server's answer to the request to join the queue.
 const joins = new Set();
 const load = window.fetch;
 const wait = (ms) => new Promise((wake) => setTimeout(wake, ms));
@@ -6,9 +6,10 @@ const wait = (ms) => new Promise((wake) => setTimeout(wake, ms));
 window.fetch = (...given) => {
     const answer = load(...given);
     if (String(given[0].url ?? given[0]).includes("/queue/join")) {
-        joins.add(answer);
-        const forget = () => joins.delete(answer);
-        answer.then(forget, forget);
+        const body = answer.then((response) => response.clone().text());
+        joins.add(body);
+        const forget = () => joins.delete(body);
+        body.then(forget, forget);
     }
     return answer;
 };
