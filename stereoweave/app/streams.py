@@ -20,8 +20,8 @@ class EndedStreams:
 
     Gradio streams the results of a window's events, and ends the stream when no event is left. A window that
     starts an event before it has read this end opens no new stream, so it would wait forever. A window that
-    has read the end disconnects. Visitors are told apart by `OwnFiles`' cookie; without it, nothing is
-    delayed.
+    has read the end disconnects. Visitors are told apart by the cookie of `OwnFiles`. Without a cookie,
+    nothing is delayed.
     """
 
     def __init__(self, app: ASGIApp) -> None:

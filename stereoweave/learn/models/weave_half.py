@@ -19,8 +19,8 @@ from stereoweave.learn.models.weave import (
     as_other_view,
 )
 
-# Numbers of channels are multiples of 16: with others, oneDNN's gradients of dilated convolutions in bfloat16
-# may not be finite.
+# Dilated convolutions have multiples of 16 channels: with others, oneDNN's gradients in bfloat16 may not be
+# finite.
 HALF = replace(
     BASE_GROWN,
     convolutions=(1, 4, 2, 2),
