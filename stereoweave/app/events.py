@@ -75,11 +75,7 @@ class Job:
 
 
 def connect_cancel(cancel: gr.Button, status: gr.HTML, events: Sequence[Any]) -> None:
-    """Let a button cancel these events; it can be pressed while one of them is running or waiting.
-
-    The first event of a click waits, so that the second one finds the event to cancel on the server.
-    """
-    cancel.click(None, None, None, js="() => window.joinsAnswered()", api_visibility="private")
+    """Let a button cancel these events; it can be pressed while one of them is running or waiting."""
     cancel.click(
         lambda: (f'<div class="cancelled">{format_notice([_CANCELLED])}</div>', gr.update(interactive=False)),
         None,

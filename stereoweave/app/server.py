@@ -37,7 +37,7 @@ def make_server(host: Host, names: Sequence[str] | None) -> FastAPI:
     """
     os.environ["GRADIO_TEMP_DIR"] = str(host.folder)
     server = FastAPI(openapi_url=None)
-    css, script = map(_read, ("page.css", "page.js"))
+    css = importlib.resources.files("stereoweave.app").joinpath("page.css").read_text(encoding="utf-8")
     gr.mount_gradio_app(
         server,
         make_page(host),
@@ -52,7 +52,7 @@ def make_server(host: Host, names: Sequence[str] | None) -> FastAPI:
         mcp_server=False,
         theme=_make_theme(),
         css=css,
-        head=f"{_NARROW}<script>{{ {script} }}</script>",  # a block, so that the page keeps its own names
+        head=_NARROW,
     )
     server.add_middleware(OwnFiles)
     server.add_middleware(EndedStreams)
@@ -60,10 +60,6 @@ def make_server(host: Host, names: Sequence[str] | None) -> FastAPI:
         server.add_middleware(TrustedHostMiddleware, allowed_hosts=names, www_redirect=False)
     server.add_middleware(ContentPolicy)
     return server
-
-
-def _read(name: str) -> str:
-    return importlib.resources.files("stereoweave.app").joinpath(name).read_text(encoding="utf-8")
 
 
 def _make_theme() -> gr.themes.Base:

@@ -53,15 +53,6 @@ window.fetch = async (...given) => {
 };
 """
 AT_WORK = re.compile("looking through the video|frame \\d")
-# A window's requests to join the queue take half a second.
-LATE_JOINS = """
-const load = window.fetch;
-window.fetch = async (...given) => {
-    if (String(given[0].url ?? given[0]).includes("/queue/join"))
-        await new Promise((wake) => setTimeout(wake, 500));
-    return load(...given);
-};
-"""
 
 pytestmark = [pytest.mark.system, pytest.mark.needs_chromium]
 
@@ -279,15 +270,6 @@ def test_a_job_cancelled_at_once_shows_no_error(visit, endless_video):
         visit.page.locator("#video-status").get_by_text("Cancelled").wait_for()
         visit.page.wait_for_timeout(1000)
         assert not visit.page.locator("#video-status .error").is_visible()
-
-
-def test_a_job_cancelled_before_the_server_has_answered_it_stops(browser, server, endless_video):
-    with visiting(browser, server[1], LATE_JOINS) as visit:
-        visit.open("Video")
-        visit.give(video_left=endless_video)
-        visit.page.click("#video-whole")
-        visit.page.click("#video-cancel")
-        visit.page.locator("#video-status").get_by_text("Cancelled").wait_for()
 
 
 # By kind: the picture's format, and its width and height.
