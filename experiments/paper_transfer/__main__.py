@@ -58,7 +58,7 @@ def paper_transfer(  # noqa: PLR0913 - each is an option of the command line
     make_folder(report)
     write_csv(report / "transfer.csv", rows)
     draw_curves(trials, out, report / "transfer.png")
-    print_means({"Means over the seeds": _COLUMNS}, "scene", summarise(rows))
+    print_means({"Steps: medians over the seeds. Errors: means": _COLUMNS}, "scene", summarise(rows))
     typer.echo(f"rows: {report / 'transfer.csv'}")
 
 

@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import fmean, median
 
 import numpy as np
 
@@ -48,12 +49,13 @@ class TransferRow:
 
 @dataclass(frozen=True, kw_only=True)
 class SceneSummary:
-    """Means over the seeds of one scene.
+    """Medians of steps, and mean errors, over the seeds of one scene.
 
     Attributes:
         scene: Name of the scene.
         scratch_steps: Steps from random weights to their lowest validation loss.
-        tuned_steps: Steps from the source's weights to the same loss; NaN if a training did not reach it.
+        tuned_steps: Steps from the source's weights to the same loss; infinite if most trainings did not
+            reach it.
         scratch_cm, tuned_cm: End-point error at the end.
     """
 
@@ -98,14 +100,16 @@ def read_rows(trials: Sequence[Trial], runs: Path) -> list[TransferRow]:
 
 
 def summarise(rows: Sequence[TransferRow]) -> list[SceneSummary]:
-    """Return the means over the seeds of each scene."""
+    """Summarise the seeds of each scene."""
     return [
         SceneSummary(
             scene=scene,
-            scratch_steps=_mean(rows, scene, SCRATCH, "scratch_best_step"),
-            tuned_steps=_mean(rows, scene, TUNED, "reached_step"),
-            scratch_cm=_mean(rows, scene, SCRATCH, "epe_cm"),
-            tuned_cm=_mean(rows, scene, TUNED, "epe_cm"),
+            scratch_steps=median(_values(rows, scene, SCRATCH, "scratch_best_step")),
+            tuned_steps=median(
+                math.inf if math.isnan(step) else step for step in _values(rows, scene, TUNED, "reached_step")
+            ),
+            scratch_cm=fmean(_values(rows, scene, SCRATCH, "epe_cm")),
+            tuned_cm=fmean(_values(rows, scene, TUNED, "epe_cm")),
         )
         for scene in dict.fromkeys(row.scene for row in rows)
     ]
@@ -132,5 +136,5 @@ def _read_curves(trials: Sequence[Trial], runs: Path) -> dict[tuple[str, str, in
     }
 
 
-def _mean(rows: Sequence[TransferRow], scene: str, start: str, column: str) -> float:
-    return float(np.mean([getattr(row, column) for row in rows if (row.scene, row.start) == (scene, start)]))
+def _values(rows: Sequence[TransferRow], scene: str, start: str, column: str) -> list[float]:
+    return [getattr(row, column) for row in rows if (row.scene, row.start) == (scene, start)]

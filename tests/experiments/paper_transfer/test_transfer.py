@@ -1,6 +1,6 @@
 import csv
 from dataclasses import replace
-from math import isnan
+from math import inf, isnan, nan
 
 import numpy as np
 import pytest
@@ -130,17 +130,23 @@ def test_a_training_from_random_weights_reaches_its_own_lowest_loss(trained):
     assert rows[2].scratch_best_step == rows[0].scratch_best_step
 
 
-def test_the_summary_is_the_mean_over_the_seeds_of_a_scene():
-    def row(start, seed, reached, cm):
-        return TransferRow(
-            scene="ship", start=start, seed=seed, steps=9, first_loss=1, last_loss=0.5, scratch_best_step=8,
-            reached_step=reached, epe_cm=cm, epe_px=1, minutes=1, commit="",
-        )  # fmt: skip
+def row(start, seed, reached, cm):
+    return TransferRow(
+        scene="ship", start=start, seed=seed, steps=9, first_loss=1, last_loss=0.5, scratch_best_step=8,
+        reached_step=reached, epe_cm=cm, epe_px=1, minutes=1, commit="",
+    )  # fmt: skip
 
-    (ship,) = summarise(
-        [row(SCRATCH, 0, 8, 50), row(SCRATCH, 1, 8, 70), row(TUNED, 0, 2, 30), row(TUNED, 1, 4, 34)]
-    )
-    assert (ship.scratch_steps, ship.tuned_steps, ship.scratch_cm, ship.tuned_cm) == (8, 3, 60, 32)
+
+def test_a_scene_has_median_steps_and_mean_errors():
+    tuned = [row(TUNED, seed, reached, cm) for seed, reached, cm in ((0, 2, 30), (1, nan, 36), (2, 5, 30))]
+    (ship,) = summarise([row(SCRATCH, 0, 8, 50), row(SCRATCH, 1, 8, 70), *tuned])
+    assert (ship.scratch_steps, ship.tuned_steps, ship.scratch_cm, ship.tuned_cm) == (8, 5, 60, 32)
+
+
+def test_steps_are_infinite_if_most_trainings_do_not_reach_the_loss():
+    tuned = [row(TUNED, seed, reached, 30) for seed, reached in ((0, nan), (1, 4), (2, nan))]
+    (ship,) = summarise([row(SCRATCH, 0, 8, 50), *tuned])
+    assert ship.tuned_steps == inf
 
 
 def test_the_curves_are_drawn(trained, tmp_path):
