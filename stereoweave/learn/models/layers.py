@@ -98,9 +98,9 @@ class DilatedDense(nn.Module):
         return x
 
 
-def mirror(x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
-    """Flip the map left to right."""
-    return x.flip(3)
+def mirror(x: Tensor, columns: int = 3) -> Tensor:
+    """Flip the map left to right; `columns` is the axis of its columns."""
+    return x.flip(columns)
 
 
 def correlation_volume(
@@ -199,8 +199,8 @@ def expected_step(logits: Float[Tensor, "b k h w"]) -> Float[Tensor, "b 1 h w"]:
 
 
 def correlate_nearby(
-    first: Float[Tensor, "b c h w"],
-    second: Float[Tensor, "b c h w"],
+    first: Float[Tensor, "b h w c"],
+    second: Float[Tensor, "b h w c"],
     disparity: Float[Tensor, "b 1 h w"],
     radius: int,
 ) -> Float[Tensor, "b k h w"]:
@@ -210,11 +210,11 @@ def correlate_nearby(
     column. Offsets are processed one at a time, which keeps gathered features in the processor's cache until
     they are summed.
     """
-    batch, channels, height, width = first.shape
+    batch, height, width, channels = first.shape
     whole = disparity.detach().floor()
     # In float32, because bfloat16 cannot represent the index of every column.
     columns = torch.arange(width, dtype=torch.float32, device=first.device) - whole
-    left, pixels = _pixels(first), _pixels(second)
+    left, pixels = first.reshape(-1, channels), second.reshape(-1, channels)
     products = []
     for step in range(-radius, radius + 2):
         found = pixels.index_select(0, _places(columns - step))
@@ -224,8 +224,8 @@ def correlate_nearby(
 
 
 def correlate_warped(
-    first: Float[Tensor, "b c h w"],
-    second: Float[Tensor, "b c h w"],
+    first: Float[Tensor, "b h w c"],
+    second: Float[Tensor, "b h w c"],
     disparity: Float[Tensor, "b 1 h w"],
     radius: int,
 ) -> Float[Tensor, "b k h w"]:
@@ -235,18 +235,17 @@ def correlate_warped(
     takes less time to compute, because only two columns per pixel are gathered for any radius. Columns
     outside the map repeat the border column. Outside the warped map, the correlation is 0.
     """
-    batch, channels, height, width = first.shape
+    batch, height, width, channels = first.shape
     columns = torch.arange(width, dtype=torch.float32, device=first.device) - disparity.detach()
     columns = columns.clamp(0, width - 1)
     below = columns.floor().clamp(0, width - 2)
     places = _places(below)
-    pixels = _pixels(second)
+    pixels = second.reshape(-1, channels)
     low, high = pixels.index_select(0, places), pixels.index_select(0, places + 1)
     warped = low + (columns - below).view(-1, 1).to(low.dtype) * (high - low)
     warped = F.pad(warped.view(batch, height, width, channels), (0, 0, radius, radius))
-    left = first.permute(0, 2, 3, 1)
     steps = range(2 * radius, -1, -1)
-    return torch.cat([(left * warped[:, :, x : x + width]).sum(3).unsqueeze(1) for x in steps], 1)
+    return torch.cat([(first * warped[:, :, x : x + width]).sum(3).unsqueeze(1) for x in steps], 1)
 
 
 def sample_at_match(
@@ -274,13 +273,8 @@ def gather_neighbours(
     )
 
 
-def _pixels(x: Float[Tensor, "b c h w"]) -> Float[Tensor, "n c"]:
-    """Return the features with one row per pixel, so that each lookup is one contiguous copy."""
-    return x.permute(0, 2, 3, 1).reshape(-1, x.shape[1])
-
-
 def _places(columns: Float[Tensor, "b 1 h w"]) -> Int64[Tensor, " n"]:
-    """Return the indices in `_pixels` of the given integer columns, each clamped to its own image row."""
+    """Return the indices of the pixels in the given integer columns, each clamped to its own image row."""
     batch, _, height, width = columns.shape
     lines = torch.arange(batch * height, device=columns.device).view(batch, 1, height, 1)
     # Clamped as integers, so that a NaN disparity gives a NaN loss instead of an error here.

@@ -147,14 +147,27 @@ class WeaveFeatures(NamedTuple):
     sixteenth: Tensor
 
 
-def as_left_view(views: Tensor, batch: int | torch.SymInt) -> Tensor:
-    """Return the maps of the left views, then the mirrored maps of the right views."""
-    return torch.cat([views[:batch], mirror(views[batch:])])
+def as_left_view(views: Tensor, batch: int | torch.SymInt, columns: int = 3) -> Tensor:
+    """Return the maps of the left views, then the mirrored maps of the right views.
+
+    `columns` is the axis of the columns.
+    """
+    return torch.cat([views[:batch], mirror(views[batch:], columns)])
 
 
-def as_other_view(views: Tensor, batch: int | torch.SymInt) -> Tensor:
-    """Return the maps of the right views, then the mirrored maps of the left views."""
-    return torch.cat([views[batch:], mirror(views[:batch])])
+def as_other_view(views: Tensor, batch: int | torch.SymInt, columns: int = 3) -> Tensor:
+    """Return the maps of the right views, then the mirrored maps of the left views, as `as_left_view`."""
+    return torch.cat([views[batch:], mirror(views[:batch], columns)])
+
+
+def as_matched_pixels(match: Tensor, batch: int | torch.SymInt) -> tuple[Tensor, Tensor]:
+    """Return the features to correlate, `as_left_view` and `as_other_view`, each [2B, H, W, C].
+
+    ONNX Runtime mirrors maps of pixels ten times as fast as maps of channels, whose rows it copies number by
+    number.
+    """
+    pixels = match.permute(0, 2, 3, 1)
+    return as_left_view(pixels, batch, 2), as_other_view(pixels, batch, 2)
 
 
 def stack_convolutions(channels: int, count: int) -> list[nn.Module]:
@@ -334,11 +347,9 @@ class WeaveNet(nn.Module):
         spread, decoded = self._propagate(quarter, first.quarter, decoded, batch)
         coarse_logits = self.weights(decoded).float()
         coarse = self.upsample(spread * 2, coarse_logits)
-        match_half = self.to_match_half(maps.half)
         fine, fine_logits, confidence = self.refinement(
             coarse,
-            as_left_view(match_half, batch),
-            as_other_view(match_half, batch),
+            *as_matched_pixels(self.to_match_half(maps.half), batch),
             first.half,
             F.pixel_shuffle(self.to_half(decoded), 2),
         )

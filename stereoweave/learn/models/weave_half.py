@@ -16,7 +16,7 @@ from stereoweave.learn.models.weave import (
     WeaveSize,
     WeaveStages,
     as_left_view,
-    as_other_view,
+    as_matched_pixels,
 )
 
 # Dilated convolutions have multiples of 16 channels: with others, oneDNN's gradients in bfloat16 may not be
@@ -92,11 +92,9 @@ class WeaveHalfNet(WeaveNet):
         batch = left.shape[0]
         inner = super().stages(F.avg_pool2d(left, 2), F.avg_pool2d(right, 2))
         stem = self.stem(torch.cat([left, right]) * 2 - 1)
-        match = self.to_match_stem(stem)
         fine, logits, confidence = self.enlargement(
             inner.disparity_px,
-            as_left_view(match, batch),
-            as_other_view(match, batch),
+            *as_matched_pixels(self.to_match_stem(stem), batch),
             as_left_view(stem, batch),
             inner.confidence_logit,
         )

@@ -103,19 +103,24 @@ def test_the_correlation_is_greatest_at_the_shift_between_the_maps():
     assert (correlation_volume(first, second, 8).argmax(1)[..., 3:] == 3).all()
 
 
+def as_pixels(maps):
+    """Return maps [B, C, H, W] with the channels of a pixel side by side [B, H, W, C]."""
+    return maps.permute(0, 2, 3, 1)
+
+
 @pytest.mark.parametrize("radius", [1, 2])
 def test_nearby_matches_equal_the_plain_loop_between_columns_and_beyond_the_borders(radius):
     first, second = torch.randn(2, 2, 4, 2, 7)
     disparity = torch.tensor([0.0, 1.25, 2.5, -1.75, 5.999, 100.3, -40.5]).expand(2, 1, 2, 7)
     expected = nearby_matches_plain(first, second, disparity, radius)
-    found = correlate_nearby(first, second, disparity, radius)
+    found = correlate_nearby(as_pixels(first), as_pixels(second), disparity, radius)
     torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-4)
 
 
 def test_nearby_matches_at_whole_disparities_are_those_of_the_correlation_volume():
     first, second = torch.randn(2, 1, 4, 2, 12)
     volume = correlation_volume(first, second, 7)
-    found = correlate_nearby(first, second, torch.full((1, 1, 2, 12), 4.0), radius=2)
+    found = correlate_nearby(as_pixels(first), as_pixels(second), torch.full((1, 1, 2, 12), 4.0), radius=2)
     torch.testing.assert_close(found[..., 6:], volume[:, 2:7, :, 6:])
 
 
@@ -124,12 +129,13 @@ def test_warped_matches_equal_the_plain_loop_between_columns_and_beyond_the_bord
     first, second = torch.randn(2, 2, 4, 2, 7)
     disparity = torch.tensor([0.0, 1.25, 2.5, -1.75, 5.999, 100.3, -40.5]).expand(2, 1, 2, 7)
     expected = warped_matches_plain(first, second, disparity, radius)
-    torch.testing.assert_close(correlate_warped(first, second, disparity, radius), expected)
+    found = correlate_warped(as_pixels(first), as_pixels(second), disparity, radius)
+    torch.testing.assert_close(found, expected)
 
 
 @pytest.mark.parametrize("matches", [correlate_nearby, correlate_warped])
 def test_columns_are_found_in_bfloat16_too_which_cannot_represent_their_indices(matches):
-    first, second = torch.randn(2, 1, 4, 1, 600).bfloat16()
+    first, second = torch.randn(2, 1, 1, 600, 4).bfloat16()
     disparity = torch.full((1, 1, 1, 600), 3.0, dtype=torch.bfloat16)
     expected = matches(first.float(), second.float(), disparity.float(), 1)
     torch.testing.assert_close(matches(first, second, disparity, 1).float(), expected, atol=0.1, rtol=0.02)
