@@ -290,7 +290,10 @@ class Refinement(nn.Module):
     def forward(
         self, disparity: Tensor, first: Tensor, second: Tensor, context: Tensor, decoded: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return disparity in half-resolution pixels, upsampling weights and confidence logits."""
+        """Return disparity in half-resolution pixels, upsampling weights and confidence logits.
+
+        `first` and `second` are the features to correlate, in pixel order (`as_matched_pixels`).
+        """
         matches = self.matches(first, second, disparity, self.radius)
         x = self.body(self.join(torch.cat([matches, context, decoded], 1)))
         correction = expected_step((matches + self.scores(x)).float())
