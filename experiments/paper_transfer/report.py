@@ -54,8 +54,8 @@ class SceneSummary:
     Attributes:
         scene: Name of the scene.
         scratch_steps: Steps from random weights to their lowest validation loss.
-        tuned_steps: Steps from the source's weights to the same loss; infinite if most trainings did not
-            reach it.
+        tuned_steps: Steps from the source's weights to the same loss; infinite if half of the
+            trainings or more did not reach it.
         scratch_cm, tuned_cm: End-point error at the end.
     """
 

@@ -207,8 +207,8 @@ def correlate_nearby(
     """Correlate column x of `first` with column x - disparity - k of `second`, for k = -radius .. radius.
 
     The correlation is linearly interpolated between columns. Columns outside the map repeat the border
-    column. Offsets are processed one at a time, which keeps gathered features in the processor's cache until
-    they are summed.
+    column. The channels of a pixel are adjacent, so each lookup is one contiguous copy. Offsets are
+    processed one at a time, which keeps gathered features in the processor's cache until they are summed.
     """
     batch, height, width, channels = first.shape
     whole = disparity.detach().floor()

@@ -156,18 +156,21 @@ def as_left_view(views: Tensor, batch: int | torch.SymInt, columns: int = 3) -> 
 
 
 def as_other_view(views: Tensor, batch: int | torch.SymInt, columns: int = 3) -> Tensor:
-    """Return the maps of the right views, then the mirrored maps of the left views, as `as_left_view`."""
+    """Return the maps of the right views, then the mirrored maps of the left views.
+
+    `columns` is the axis of the columns.
+    """
     return torch.cat([views[batch:], mirror(views[:batch], columns)])
 
 
 def as_matched_pixels(match: Tensor, batch: int | torch.SymInt) -> tuple[Tensor, Tensor]:
-    """Return the features to correlate, `as_left_view` and `as_other_view`, each [2B, H, W, C].
+    """Return features in both arrangements, `as_left_view` and `as_other_view`, each [2B, H, W, C].
 
-    ONNX Runtime mirrors maps of pixels ten times as fast as maps of channels, whose rows it copies number by
-    number.
+    ONNX Runtime mirrors maps faster in this order of pixels: it copies all channels of a pixel at once, and
+    otherwise number by number.
     """
     pixels = match.permute(0, 2, 3, 1)
-    return as_left_view(pixels, batch, 2), as_other_view(pixels, batch, 2)
+    return as_left_view(pixels, batch, columns=2), as_other_view(pixels, batch, columns=2)
 
 
 def stack_convolutions(channels: int, count: int) -> list[nn.Module]:
@@ -292,7 +295,7 @@ class Refinement(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return disparity in half-resolution pixels, upsampling weights and confidence logits.
 
-        `first` and `second` are the features to correlate, in pixel order (`as_matched_pixels`).
+        `first` and `second` are the features to correlate, from `as_matched_pixels`.
         """
         matches = self.matches(first, second, disparity, self.radius)
         x = self.body(self.join(torch.cat([matches, context, decoded], 1)))

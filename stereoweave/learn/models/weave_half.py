@@ -46,7 +46,10 @@ class Enlargement(Refinement):
     def forward(
         self, disparity: Tensor, first: Tensor, second: Tensor, context: Tensor, confidence_logit: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return disparity in half-resolution pixels, upsampling weights and confidence logits."""
+        """Return disparity in half-resolution pixels, upsampling weights and confidence logits.
+
+        `first` and `second` are the features to correlate, from `as_matched_pixels`.
+        """
         # The mean of a 9x9 window, as in other stages, would take ONNX Runtime a tenth of the whole time.
         departure = disparity - F.avg_pool2d(disparity, 3, 1, 1, count_include_pad=False)
         departure = departure.clamp(-_LARGEST_DEPARTURE, _LARGEST_DEPARTURE)
