@@ -83,11 +83,12 @@ def start(browser: Browser, *flags: str) -> Browser:
 
 
 def open_page(place: Browser | BrowserContext, path: Path, **options) -> Page:
-    """Open the page, and wait until the viewer is ready."""
+    """Open the page, and wait for its first frame, which sets the size of the canvas."""
     page = place.new_page(**options)
     page.on("pageerror", lambda error: FAILED.append(str(error)))
     page.goto(path.as_uri())
     wait_until(page, "Boolean(window.stereoweaveViewer)")
+    page.evaluate(FRAMES, 1)
     return page
 
 

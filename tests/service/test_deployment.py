@@ -180,10 +180,15 @@ def test_a_full_service_refuses_requests_and_answers_the_accepted_ones(service):
         health = service.get("/health")
     assert health.json()["status"] == "ok"
     done, refused = ([each for each in responses if each.status_code == status] for status in (200, 503))
-    assert len(done) >= WAITING
     assert len(done) + len(refused) == 16
-    assert {response.headers["Retry-After"] for response in refused} == {"1"}
-    assert "try again later" in refused[0].json()["detail"]
+    full = [each for each in refused if f"fewer than {WAITING} pending requests" in each.text]
+    late = [each for each in refused if "would make this request" in each.text]  # on a busy machine
+    assert len(full) + len(late) == len(refused)
+    assert full
+    assert done
+    assert len(done) + len(late) >= WAITING
+    assert {response.headers["Retry-After"] for response in full} == {"1"}
+    assert all("try again later" in response.json()["detail"] for response in refused)
 
 
 def test_hostile_requests_and_calibrations_neither_delay_health_checks_nor_fill_memory(running):
