@@ -24,6 +24,7 @@ from stereoweave.learn.models.layers import (
     correlation_volume,
     expected_step,
     local_soft_argmax,
+    mean_around,
     mirror,
     upsample_convex,
     upsample_to_a_side,
@@ -268,7 +269,7 @@ class Propagation(nn.Module):
     def forward(self, disparity: Tensor, quarter: Tensor, decoded: Tensor) -> tuple[Tensor, Tensor]:
         """Return the corrected disparity in levels [B, 1, H/4, W/4] and the corrected decoder features."""
         # In float32, because near a disparity of 100 px bfloat16 cannot resolve the slope of a surface.
-        departure = disparity - F.avg_pool2d(disparity, 9, 1, 4, count_include_pad=False)
+        departure = disparity - mean_around(disparity, 9)
         x = self.body(self.join(torch.cat([decoded, quarter, departure, disparity / 16], 1)))
         return disparity + self.correction(x).float(), decoded + self.decoded(x)
 

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from stereoweave.learn.models.layers import Halve
+from stereoweave.learn.models.layers import Halve, mean_around
 from stereoweave.learn.models.weave import (
     BASE_GROWN,
     SMALL,
@@ -50,8 +50,8 @@ class Enlargement(Refinement):
 
         `first` and `second` are the features to correlate, from `as_matched_pixels`.
         """
-        # The mean of a 9x9 window, as in other stages, would take ONNX Runtime a tenth of the whole time.
-        departure = disparity - F.avg_pool2d(disparity, 3, 1, 1, count_include_pad=False)
+        # A smaller window than in other stages, because this map is larger.
+        departure = disparity - mean_around(disparity, 3)
         departure = departure.clamp(-_LARGEST_DEPARTURE, _LARGEST_DEPARTURE)
         # Scaled to the magnitude of other features.
         handed = torch.cat([departure, disparity / 32, confidence_logit / 4], 1)
@@ -93,7 +93,7 @@ class WeaveHalfNet(WeaveNet):
         one more upsampling. The confidence for the halved images has no loss of its own.
         """
         batch = left.shape[0]
-        inner = super().stages(F.avg_pool2d(left, 2), F.avg_pool2d(right, 2))
+        inner = super().stages(_halve(left), _halve(right))
         stem = self.stem(torch.cat([left, right]) * 2 - 1)
         fine, logits, confidence = self.enlargement(
             inner.disparity_px,
@@ -110,3 +110,11 @@ class WeaveHalfNet(WeaveNet):
             confidence_logit=confidence.float(),
             upsampling_logits=(*inner.upsampling_logits, logits),
         )
+
+
+def _halve(image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h2 w2"]:
+    """Return the image at half its size, whose pixels are the means of 2x2 pixels.
+
+    Bilinear interpolation gives the same, in a quarter of the time of ONNX Runtime's average.
+    """
+    return F.interpolate(image, scale_factor=0.5, mode="bilinear")

@@ -10,6 +10,7 @@ from stereoweave.learn.models.layers import (
     Halve,
     Residual,
     gather_neighbours,
+    mean_around,
     sample_at_match,
     zero_initialise,
 )
@@ -82,7 +83,7 @@ class Completion(nn.Module):
         """Return occlusion cues: deviation from the mean, disparity, left-right check and border check."""
         columns = torch.arange(disparity.shape[3], dtype=torch.float32, device=disparity.device)
         # In float32, because near a disparity of 100 px bfloat16 cannot resolve the slope of a surface.
-        departure = disparity - F.avg_pool2d(disparity, 9, 1, 4, count_include_pad=False)
+        departure = disparity - mean_around(disparity, 9)
         check = (sample_at_match(other, disparity) - disparity).clamp(-_LARGEST_CHECK, _LARGEST_CHECK)
         inside = (columns - disparity).clamp(-_LARGEST_CHECK, _LARGEST_CHECK)
         return departure, disparity / 16, check, inside

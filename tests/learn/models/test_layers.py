@@ -15,6 +15,7 @@ from stereoweave.learn.models.layers import (
     expected_step,
     gather_neighbours,
     local_soft_argmax,
+    mean_around,
     mirror,
     sample_at_match,
     soft_argmin,
@@ -320,3 +321,12 @@ def test_neighbours_are_the_values_at_the_offsets_and_outside_the_map_those_of_t
     below, left_far = gather_neighbours(x, [(1, 0), (0, -5)])[0]
     assert below.tolist() == [[4, 5, 6, 7], [8, 9, 10, 11], [8, 9, 10, 11]]
     assert left_far.tolist() == [[0] * 4, [4] * 4, [8] * 4]
+
+
+def test_the_mean_around_a_pixel_is_over_the_part_of_its_window_inside_the_map():
+    x = torch.tensor([[1.0, 2, 3, 4], [5, 6, 7, 8], [9, 10, 11, 12]])[None, None]
+    found = mean_around(x, 3)[0, 0]
+    assert found[1, 1] == pytest.approx(6)  # nine pixels
+    assert found[0, 0] == pytest.approx((1 + 2 + 5 + 6) / 4)
+    assert found[2, 1] == pytest.approx((5 + 6 + 7 + 9 + 10 + 11) / 6)
+    torch.testing.assert_close(mean_around(x, 9), torch.full((1, 1, 3, 4), 6.5))
