@@ -42,3 +42,13 @@ def test_negative_disparities_match_everywhere_in_the_left_border():
     left_px = plane(-3.0)
     left_px[5] = -4
     assert np.array_equal(smooth(left_px, left_px)[0], left_px)
+
+
+def test_smoothed_pixels_are_the_medians_of_the_eleven_pixels_of_their_columns(rng):
+    left_px, right_px = rng.uniform(-5, WIDTH, (2, HEIGHT, WIDTH)).astype(np.float32)
+    found = smooth(left_px, right_px)
+    matches = np.arange(WIDTH) - left_px, np.arange(WIDTH)[::-1] - right_px
+    for given_px, found_px, column in zip((left_px, right_px), found, matches, strict=True):
+        around = np.pad(given_px, ((5, 5), (0, 0)), mode="edge")
+        medians_px = [np.median(around[y : y + 11], axis=0) for y in range(HEIGHT)]
+        np.testing.assert_array_equal(found_px, np.where(column < 0, medians_px, given_px))
