@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Int
 
+from stereoweave.matching.medians import find_median
 from stereoweave.stereo import Estimate
 
 # The median of this many visible pixels represents one end of a run, because the first pixel alone often
@@ -33,9 +34,8 @@ def fill_occluded(estimate: Estimate, left_seen: Bool[np.ndarray, "h w"] | None 
         estimate: The estimate to fill.
         left_seen: Mask of left pixels with content, from which occluded pixels may be filled; default: all.
     """
-    occluded = estimate.occluded
-    visible = ~occluded if left_seen is None else ~occluded & left_seen
-    flat = np.flatnonzero(occluded)
+    visible = ~estimate.occluded if left_seen is None else ~estimate.occluded & left_seen
+    flat = np.flatnonzero(estimate.occluded)
     own_px, claimed = estimate.disparity_px.ravel()[flat], estimate.confidence.ravel()[flat]
     row_px, beside = _fill_rows(estimate, visible)
     filled_px = cv2.medianBlur(row_px, _MEDIAN_PX).ravel()[flat]
@@ -43,8 +43,8 @@ def fill_occluded(estimate: Estimate, left_seen: Bool[np.ndarray, "h w"] | None 
     kept[kept] = _within_surroundings(estimate.disparity_px, visible, flat[kept])
     believed = claimed + _SHARE_BESIDE * (beside.ravel()[flat] - claimed)
     disparity_px, confidence = estimate.disparity_px.copy(), estimate.confidence.copy()
-    disparity_px[occluded] = np.where(kept, own_px, filled_px)
-    confidence[occluded] = np.where(kept | (claimed == 0), claimed, believed)
+    disparity_px.ravel()[flat] = np.where(kept, own_px, filled_px)
+    confidence.ravel()[flat] = np.where(kept | (claimed == 0), claimed, believed)
     return replace(estimate, disparity_px=disparity_px, confidence=confidence)
 
 
@@ -54,37 +54,45 @@ def _fill_rows(estimate: Estimate, visible: Bool[np.ndarray, "h w"]) -> Float32[
     The background is the farther of the two surfaces at the ends of the pixel's run of invisible pixels. In a
     row without visible pixels, each pixel keeps its own values.
     """
-    maps = np.stack([estimate.disparity_px, estimate.confidence])
-    invisible = np.pad(~visible, ((0, 0), (1, 1)))
-    changes = np.flatnonzero(invisible.ravel()[1:] != invisible.ravel()[:-1])
-    rows, columns = np.divmod(changes.reshape(-1, 2), invisible.shape[1])
-    steps = np.arange(_END_PX)
-    left = _medians(maps, visible, rows[:, :1], columns[:, :1] - 1 - steps)
-    right = _medians(maps, visible, rows[:, 1:], columns[:, 1:] + steps)
-    farther = np.where(np.isnan(left[0]) | (right[0] < left[0]), right, left)
-    background = np.repeat(farther, np.diff(columns)[:, 0], axis=1)
-    known = ~np.isnan(background[0])
-    maps.reshape(2, -1)[:, np.flatnonzero(~visible)[known]] = background[:, known]
-    return maps
+    # Invisible pixels beside each row end its runs, so that runs and their ends are found without rows.
+    beside = ((0, 0), (_END_PX, _END_PX))
+    height, width = visible.shape
+    maps = np.zeros((2, height, width + 2 * _END_PX), np.float32)
+    maps[:, :, _END_PX:-_END_PX] = estimate.disparity_px, estimate.confidence
+    flat_maps, seen = maps.reshape(2, -1), np.pad(visible, beside).ravel()
+    gaps = np.pad(~visible & visible.any(axis=1, keepdims=True), beside).ravel()
+    changes = 1 + np.flatnonzero(gaps[1:] != gaps[:-1])
+    starts, ends = changes[::2], changes[1::2]
+    left, right = _medians(flat_maps, seen, starts - 1, -1), _medians(flat_maps, seen, ends, 1)
+    background = np.repeat(np.where(right[0] < left[0], right, left), ends - starts, axis=1)
+    filled = np.flatnonzero(gaps)
+    for values, found in zip(flat_maps, background, strict=True):
+        values[filled] = found
+    return maps[:, :, _END_PX:-_END_PX]
 
 
 def _medians(
-    maps: Float32[np.ndarray, "2 h w"],
-    visible: Bool[np.ndarray, "h w"],
-    rows: Int[np.ndarray, "n 1"],
-    columns: Int[np.ndarray, "n k"],
+    maps: Float32[np.ndarray, "2 hw"],
+    visible: Bool[np.ndarray, " hw"],
+    flat: Int[np.ndarray, " n"],
+    step: int,
 ) -> Float32[np.ndarray, "2 n"]:
-    """Return the lower median of the visible pixels among K columns of each row; NaN if there are none.
+    """Return the lower median of the visible ones of 7 pixels in a row; infinity if the first is not visible.
 
-    Row i of `columns` [N, K] belongs to `rows[i]`.
+    Args:
+        maps: Maps, each in row-major order.
+        visible: Mask of visible pixels.
+        flat: Index of the first pixel of each row of 7.
+        step: Difference of the indices of successive pixels.
     """
-    width = maps.shape[2]
-    at = width * rows + columns.clip(0, width - 1)
-    known = (columns >= 0) & (columns < width) & visible.ravel()[at]
-    ordered = np.where(known, maps.reshape(2, -1).take(at, axis=1), np.float32(np.nan))
-    ordered.sort(axis=2)
-    middle = np.maximum(known.sum(axis=1) - 1, 0) // 2
-    return ordered[:, np.arange(len(middle)), middle]
+    first, values = visible[flat], []
+    # The others count alternately as less and as greater than all, so that they do not move the median.
+    other = np.full(flat.shape, -np.inf, np.float32)
+    for away in range(0, _END_PX * step, step):
+        known = visible[flat + away]
+        values.append(np.where(known, maps.take(flat + away, axis=1), other))
+        other = np.where(known, other, -other)
+    return np.where(first, find_median(values), np.float32(np.inf))
 
 
 def _within_surroundings(
