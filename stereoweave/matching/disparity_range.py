@@ -42,7 +42,8 @@ class _Texture(NamedTuple):
 
     Attributes:
         windows: Grey levels minus their local mean, in windows [first row, centre column, rows, columns].
-        scale: Factor that normalises the window around each pixel to length 1; 0 for plain windows.
+        scale: Factor that normalises the window around each pixel to length 1; 0 for plain windows, and in
+            rows that are not matched.
     """
 
     windows: Float32[np.ndarray, "h2 w r c"]
@@ -134,7 +135,7 @@ def _match_rows(
     height = left.shape[0]
     rows = np.linspace(_WINDOW_ROWS // 2, height - 1 - _WINDOW_ROWS // 2, min(_ROWS, height // 4))
     rows = rows.round().astype(int)
-    own, other = _texture(left), _texture(right)
+    own, other = _texture(left, rows), _texture(right, rows)
     other.scale[~seen] = 0
     rows, columns = _find_salient(left, rows, wanted & (own.scale > 0))
     likeness = _likeness(own, rows, columns, other)
@@ -175,14 +176,15 @@ def _find_salient(
     return places[0][ok], places[1][ok]
 
 
-def _texture(grey: Float32[np.ndarray, "h w"]) -> _Texture:
+def _texture(grey: Float32[np.ndarray, "h w"], rows: Int[np.ndarray, " r"]) -> _Texture:
+    """Return the windows of an image, and their scale in the given rows."""
     size = (_WINDOW_COLUMNS, _WINDOW_ROWS)
     uneven = grey - cv2.blur(grey, size)
     # Rounding in cv2.blur may produce values slightly below 0.
-    contrast = np.sqrt(np.maximum(cv2.blur(uneven * uneven, size), 0))
+    contrast = np.sqrt(np.maximum(cv2.blur(uneven * uneven, size)[rows], 0))
     length = np.sqrt(np.float32(_WINDOW_ROWS * _WINDOW_COLUMNS)) * contrast
-    scale = np.zeros_like(length)
-    np.divide(1, length, out=scale, where=contrast >= _LEAST_CONTRAST_LEVELS)
+    scale = np.zeros_like(grey)
+    scale[rows] = np.divide(1, length, out=np.zeros_like(length), where=contrast >= _LEAST_CONTRAST_LEVELS)
     beside = _WINDOW_COLUMNS // 2
     around = cv2.copyMakeBorder(uneven, 0, 0, beside, beside, cv2.BORDER_REPLICATE)
     return _Texture(np.lib.stride_tricks.sliding_window_view(around, size[::-1]), scale)
