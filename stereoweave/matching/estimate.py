@@ -179,7 +179,11 @@ def _find_downscale(
         rows, columns = matcher.fixed_size
         return max(height / rows, width / (columns - (_ROUNDED_PX if moved_px else 0)))
     too_many = (width * width * height / (_FILLED * PIXEL_PAIRS_AT_ONCE)) ** (1 / 3)
-    return max(too_many, height / LONGEST_SIDE_PX, width / LONGEST_SIDE_PX)
+    scale = max(too_many, height / LONGEST_SIDE_PX, width / LONGEST_SIDE_PX)
+    # The network takes a multiple of rows, which in a wide image may be far fewer than fit into memory.
+    while not matcher.sees_whole(round(width / scale), round(height / scale)):
+        scale *= 1.01
+    return scale
 
 
 def _resize(pair: StereoPair, scale: float) -> StereoPair:

@@ -156,6 +156,15 @@ def test_a_downscaled_pair_fits_one_run_without_seams(matcher, size):
     assert abs(seen.shape[1] / seen.shape[0] - size[1] / size[0]) < 0.01 * size[1] / size[0]
 
 
+def test_a_wide_pair_fits_one_run_of_a_network_that_takes_multiples_of_32_rows():
+    matcher = Matcher("base")
+    assert matcher.multiple_of == 32
+    photo = np.broadcast_to(np.zeros((1, 1, 3), np.uint8), (700, 4548, 3))
+    seen = matching._fit_network(matcher, sw.StereoPair(left=photo, right=photo)).left
+    assert matcher.sees_whole(seen.shape[1], seen.shape[0])
+    assert seen.shape[1] > 2800
+
+
 def test_a_video_frame_of_1920x1080_fits_one_run(matcher):
     assert matcher.sees_whole(1920, 1080)
 
