@@ -51,7 +51,8 @@ def fix_size(source: Path, out: Path, width: int, height: int) -> dict[str, Any]
 def check_size(width: int, height: int, multiple_of: int) -> None:
     """Raise StereoweaveError if the network does not accept the size."""
     if min(width, height) < SMALLEST_SIDE_PX or width % multiple_of or height % multiple_of:
-        suggested = "x".join(str(max(-(-x // multiple_of), 2) * multiple_of) for x in (width, height))
+        sides = (max(side, SMALLEST_SIDE_PX) for side in (width, height))
+        suggested = "x".join(str(-(-side // multiple_of) * multiple_of) for side in sides)
         raise StereoweaveError(
             f"expected multiples of {multiple_of} that are at least {SMALLEST_SIDE_PX}, "
             f"found {width}x{height}; choose {suggested}; smaller pictures are padded to it",

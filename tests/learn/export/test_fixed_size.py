@@ -9,7 +9,7 @@ import pytest
 from learn_examples import complaint
 
 from stereoweave.learn.export import fixed_size
-from stereoweave.matching.matcher import Matcher
+from stereoweave.matching.matcher import Matcher, model_file
 
 SMALL = Path(str(files("stereoweave") / "weights" / "small.onnx"))
 
@@ -61,6 +61,13 @@ def test_a_size_that_the_network_cannot_take_is_refused(tmp_path, width, height,
     assert message.startswith(f"{expected}, found {width}x{height}; ")
     assert suggested in message
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_least_size_is_suggested_of_a_network_that_takes_multiples_of_32(tmp_path):
+    base = model_file("base")
+    message = complaint(fixed_size.fix_size, base, tmp_path / "out.onnx", 100, 16)
+    assert "found 100x16; choose 128x32;" in message
+    fixed_size.fix_size(base, tmp_path / "out.onnx", 128, 32)
 
 
 def test_a_file_for_one_size_cannot_be_converted_to_another_size(fixed, tmp_path):
