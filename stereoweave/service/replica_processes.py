@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from stereoweave.errors import FormatError
+from stereoweave.matching.options import MatchOptions
 from stereoweave.pictures.prepare import Request
 from stereoweave.service.answers import BatchAnswerer, ServiceAnswer, ServiceJob, load_measurer
 from stereoweave.system.child_process import ChildProcess, ProcessDiedError
@@ -55,7 +56,13 @@ class ReplicaProcesses:
         """
         pictures = (_SAMPLE / "left.jpg", _SAMPLE / "right.jpg")
         plain = ServiceJob(folder=_SAMPLE, pictures=pictures, file="disparity.png")
-        every_option = replace(plain, file="view.png", request=Request(rectify=True), checked=True)
+        every_option = replace(
+            plain,
+            file="view.png",
+            request=Request(rectify=True),
+            options=MatchOptions(refined=True),
+            checked=True,
+        )
         for job in (every_option, plain):
             start_s = time.perf_counter()
             (answer,) = self._answerer([job], timeout_s=None)
