@@ -1,7 +1,7 @@
 """Long work of the page as Gradio's events, which a button cancels and a closed tab ends."""
 
 import asyncio
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -27,6 +27,68 @@ _LOOK_S = 0.2
 _CANCELLED = "Cancelled. Change what you like, and start again. A result below is from before."
 
 
+class Cancelled(Exception):
+    """The visitor cancelled the work."""
+
+
+class CancelButton:
+    """Button that cancels a visitor's work of one form.
+
+    Gradio cancels only work that the server knows. The button also stops work that reaches the server later.
+
+    Args:
+        name: ID of the button's element.
+    """
+
+    def __init__(self, name: str) -> None:
+        self.button = gr.Button("Cancel", variant="stop", interactive=False, elem_id=name)
+        self._pressed: set[str] = set()
+
+    def is_pressed(self, visitor: str) -> bool:
+        """Return whether the visitor has cancelled the work that the button was last switched on for."""
+        return visitor in self._pressed
+
+    def connect(self, status: gr.HTML, events: Sequence[Any]) -> None:
+        """Let the button cancel these events; it can be pressed while one of them is running or waiting."""
+
+        def press(request: gr.Request) -> tuple[str, Any]:
+            self._pressed.add(str(request.session_hash))
+            said = f'<div class="cancelled">{format_notice([_CANCELLED])}</div>'
+            return said, gr.update(interactive=False)
+
+        self.button.click(
+            press,
+            None,
+            [status, self.button],
+            cancels=list(events),
+            concurrency_limit=None,
+            api_visibility="private",
+        )
+        scroll_to(status, [self.button.click])
+
+    def switch(self, triggers: Sequence[Any], *, on: bool) -> None:
+        """Switch the button on or off at these triggers.
+
+        A browser runs the events of a trigger one after the other, so the button must be switched on before
+        the trigger is connected to its work.
+        """
+
+        def switch(request: gr.Request) -> Any:
+            if on:
+                self._pressed.discard(str(request.session_hash))
+            return gr.update(interactive=on)
+
+        for trigger in triggers:
+            trigger(
+                switch,
+                None,
+                self.button,
+                show_progress="hidden",
+                concurrency_limit=None,
+                api_visibility="private",
+            )
+
+
 @dataclass(frozen=True)
 class Host:
     """What the page's parts share: a folder for results, processes for long work, and the provider."""
@@ -35,15 +97,25 @@ class Host:
     workers: Workers
     provider: str
 
-    async def work(self, request: gr.Request, work: Work[Done], progress: Any) -> Done:
-        """Do a visitor's work in a process, and show its progress. Raises the errors of `Workers.run`."""
-        return await self.workers.run(str(request.session_hash), work, partial(_show_progress, progress))
+    async def work(self, request: gr.Request, work: Work[Done], progress: Any, cancel: CancelButton) -> Done:
+        """Do a visitor's work in a process, and show its progress.
+
+        Raises:
+            Cancelled: If the visitor pressed the button.
+            Exception: As for `Workers.run`.
+        """
+        async with self.start(request, work, cancel) as job:
+            while not await job.is_done():
+                if job.what:
+                    progress(job.share, desc=job.what)
+            return await job.task
 
     @asynccontextmanager
-    async def start(self, request: gr.Request, work: Work[Any]) -> AsyncIterator["Job"]:
+    async def start(self, request: gr.Request, work: Work[Any], cancel: CancelButton) -> AsyncIterator["Job"]:
         """Do a visitor's work in a process during the block, at whose end it is stopped."""
-        job = Job()
-        job.task = asyncio.create_task(self.workers.run(str(request.session_hash), work, job.hear))
+        visitor = str(request.session_hash)
+        job = Job(partial(cancel.is_pressed, visitor))
+        job.task = asyncio.create_task(self.workers.run(visitor, work, job.hear))
         try:
             yield job
         finally:
@@ -54,6 +126,9 @@ class Host:
 class Job:
     """Work under way.
 
+    Args:
+        is_cancelled: Function that returns whether the visitor has cancelled the work.
+
     Attributes:
         task: Task whose result is that of the work.
         share, what: The finished share, from 0 to 1, and the name of the step.
@@ -61,7 +136,8 @@ class Job:
 
     task: asyncio.Task[Any]
 
-    def __init__(self) -> None:
+    def __init__(self, is_cancelled: Callable[[], bool]) -> None:
+        self._is_cancelled = is_cancelled
         self.share, self.what = 0.0, ""
 
     def hear(self, share: float, what: str) -> None:
@@ -69,22 +145,15 @@ class Job:
         self.share, self.what = share, what
 
     async def is_done(self) -> bool:
-        """Wait for a short time, and return whether the work is done or has failed."""
+        """Wait for a short time, and return whether the work is done or has failed.
+
+        Raises:
+            Cancelled: If the visitor has cancelled it.
+        """
+        if self._is_cancelled():
+            raise Cancelled
         await asyncio.wait([self.task], timeout=_LOOK_S)
         return self.task.done()
-
-
-def connect_cancel(cancel: gr.Button, status: gr.HTML, events: Sequence[Any]) -> None:
-    """Let a button cancel these events; it can be pressed while one of them is running or waiting."""
-    cancel.click(
-        lambda: (f'<div class="cancelled">{format_notice([_CANCELLED])}</div>', gr.update(interactive=False)),
-        None,
-        [status, cancel],
-        cancels=list(events),
-        concurrency_limit=None,
-        api_visibility="private",
-    )
-    scroll_to(status, [cancel.click])
 
 
 def scroll_to(status: gr.HTML, triggers: Sequence[Any]) -> None:
@@ -97,24 +166,3 @@ def scroll_to(status: gr.HTML, triggers: Sequence[Any]) -> None:
     }}"""
     for trigger in triggers:
         trigger(None, None, None, js=look, api_visibility="private")
-
-
-def switch(cancel: gr.Button, triggers: Sequence[Any], *, on: bool) -> None:
-    """Switch the button to cancel on or off at these triggers.
-
-    A browser runs the events of a trigger one after the other, so the button must be switched on before the
-    trigger is connected to its work.
-    """
-    for trigger in triggers:
-        trigger(
-            partial(gr.update, interactive=on),
-            None,
-            cancel,
-            show_progress="hidden",
-            concurrency_limit=None,
-            api_visibility="private",
-        )
-
-
-def _show_progress(progress: Any, share: float, what: str) -> None:
-    progress(share, desc=what)

@@ -6,6 +6,7 @@ from typing import Any
 
 import gradio as gr
 
+from stereoweave.app.events import CancelButton
 from stereoweave.app.notices import name_setting
 from stereoweave.app.session import Uploads
 from stereoweave.errors import StereoweaveError
@@ -66,7 +67,7 @@ class PairForm:
                 self.focal_px = _make_optional_number(LABELS["focal_px"], "focal")
                 self.baseline_mm = _make_optional_number(LABELS["baseline_m"], "baseline")
         self.find = gr.Button("Find depth", variant="primary", elem_id="find")
-        self.cancel = gr.Button("Cancel", variant="stop", interactive=False, elem_id="cancel")
+        self.cancel = CancelButton("cancel")
         self.sample = gr.Button("Try the sample", elem_id="sample")
 
     @property

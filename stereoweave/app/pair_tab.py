@@ -10,7 +10,7 @@ from typing import Any
 
 import gradio as gr
 
-from stereoweave.app.events import LIFETIME_S, MATCHING, Host, connect_cancel, scroll_to, switch
+from stereoweave.app.events import LIFETIME_S, MATCHING, Cancelled, Host, scroll_to
 from stereoweave.app.notices import (
     Wording,
     format_frame,
@@ -80,7 +80,9 @@ class PairTab:
             with gr.Tab("View", id="first"):
                 self._build_views()
             with gr.Tab("3-D picture") as self._picture_tab:
-                self._stereo = StereoPictureTab(self._host, self._wording, self._session, self._position)
+                self._stereo = StereoPictureTab(
+                    self._host, self._wording, self._form.cancel, self._session, self._position
+                )
             with gr.Tab("Explore") as self._report_tab:
                 self._report = gr.HTML(elem_id="report", padding=False, min_height=200)
             with gr.Tab("Measure"):
@@ -117,7 +119,7 @@ class PairTab:
         """Connect events to their handlers."""
         form, taken = self._form, [self._status, *self._file_parts]
         scroll_to(self._status, [form.find.click, form.sample.click])
-        switch(form.cancel, [form.find.click, form.sample.click], on=True)
+        form.cancel.switch([form.find.click, form.sample.click], on=True)
         sampled = form.sample.click(form.fill_in_sample, None, form.fields, api_visibility="private")
         long, ends = [], []
         for begin in (form.find.click, sampled.then):
@@ -134,9 +136,9 @@ class PairTab:
             scroll_to(self._status, [found.then])
             long += [found, written]
             ends.append(written.then)
-        made = [self._connect_report(), *self._stereo.connect(self._picture_tab, form.cancel)]
-        connect_cancel(form.cancel, self._status, [*long, *made])
-        switch(form.cancel, [*ends, *(event.then for event in made)], on=False)
+        made = [self._connect_report(), *self._stereo.connect(self._picture_tab)]
+        form.cancel.connect(self._status, [*long, *made])
+        form.cancel.switch([*ends, *(event.then for event in made)], on=False)
         self._connect_views()
 
     def _connect_report(self) -> Any:
@@ -145,7 +147,7 @@ class PairTab:
         Returns:
             The event that shows it.
         """
-        switch(self._form.cancel, [self._report_tab.select], on=True)
+        self._form.cancel.switch([self._report_tab.select], on=True)
         return self._report_tab.select(
             self._show_report, self._session, self._report, show_progress_on=self._report, **MATCHING
         )
@@ -190,10 +192,14 @@ class PairTab:
         """Match the given pictures, and return the page's new content: the result or an error."""
         try:
             uploads = self._form.read(given, self._host.provider)
-            result = await self._host.work(request, partial(match_uploads, uploads), progress)
+            result = await self._host.work(
+                request, partial(match_uploads, uploads), progress, self._form.cancel
+            )
             progress(0.6, desc="showing")
             # Otherwise, all other visitors would wait.
             shown = await asyncio.to_thread(self._open_result, result, given[self._position])
+        except Cancelled:
+            return {self._status: gr.skip()}
         except (StereoweaveError, OSError) as error:
             shown = {
                 self._status: self._wording.format_error(error),
@@ -216,7 +222,9 @@ class PairTab:
             return {self._files: gr.skip()}
         work = partial(write_all, session.result, session.folder)
         try:
-            written = await self._host.work(request, work, progress)
+            written = await self._host.work(request, work, progress, self._form.cancel)
+        except Cancelled:
+            return {self._status: gr.skip()}
         except (StereoweaveError, OSError) as error:
             return {self._status: self._wording.format_error(error)}
         archive = written.archive
@@ -280,7 +288,9 @@ class PairTab:
         if not file.exists():
             work = partial(write_shown_report, session.result, file)
             try:
-                await self._host.work(request, work, progress)
+                await self._host.work(request, work, progress, self._form.cancel)
+            except Cancelled:
+                return ""
             except (StereoweaveError, OSError) as error:
                 return self._wording.format_error(error)
         try:

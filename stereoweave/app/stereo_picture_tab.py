@@ -7,7 +7,7 @@ from uuid import uuid4
 
 import gradio as gr
 
-from stereoweave.app.events import MATCHING, Host, switch
+from stereoweave.app.events import MATCHING, CancelButton, Cancelled, Host
 from stereoweave.app.notices import Wording, format_frame, format_paragraphs
 from stereoweave.app.pair_form import LABELS
 from stereoweave.app.stereo_pictures import AUTOMATIC_PX, FULL_PX, KINDS, Wish, write_stereo_picture
@@ -34,12 +34,15 @@ class StereoPictureTab:
     Args:
         host: What the page's parts share.
         wording: The form's words.
+        cancel: The form's button that cancels work.
         session: The visitor's result.
         position: The viewpoint of the kind that shows one view.
     """
 
-    def __init__(self, host: Host, wording: Wording, session: gr.State, position: gr.Slider) -> None:
-        self._host, self._wording = host, wording
+    def __init__(
+        self, host: Host, wording: Wording, cancel: CancelButton, session: gr.State, position: gr.Slider
+    ) -> None:
+        self._host, self._wording, self._cancel = host, wording, cancel
         self._session, self._position = session, position
         with gr.Row(equal_height=True):
             self._kind = gr.Dropdown(
@@ -79,14 +82,14 @@ class StereoPictureTab:
             self._file: gr.update(value=None, visible=False),
         }
 
-    def connect(self, tab: gr.Tab, cancel: gr.Button) -> list[Any]:
+    def connect(self, tab: gr.Tab) -> list[Any]:
         """Make the chosen picture of the session when the tab is opened or a choice changes.
 
         Returns:
             The events that make it.
         """
         begins = [tab.select, self._kind.input, self._size.input, self._crops.input]
-        switch(cancel, begins, on=True)
+        self._cancel.switch(begins, on=True)
         asked: set[Any] = {self._session, self._kind, self._size, self._crops, self._position}
         self._kind.focus(None, None, None, js=_SHOW_CHOICE, api_visibility="private")
         self._kind.input(
@@ -129,7 +132,9 @@ class StereoPictureTab:
         if wish not in session.stereo_pictures:
             work = partial(write_stereo_picture, wish, session.result, session.folder / uuid4().hex)
             try:
-                session.stereo_pictures[wish] = await self._host.work(request, work, progress)
+                session.stereo_pictures[wish] = await self._host.work(request, work, progress, self._cancel)
+            except Cancelled:
+                return {self._viewing: viewing}
             except (StereoweaveError, OSError) as error:
                 return {self._viewing: self._wording.format_error(error), **self.empty()}
         made = session.stereo_pictures[wish]

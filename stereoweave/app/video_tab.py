@@ -10,7 +10,7 @@ from typing import Any
 
 import gradio as gr
 
-from stereoweave.app.events import LIFETIME_S, STILLS, VIDEOS, Host, connect_cancel, scroll_to, switch
+from stereoweave.app.events import LIFETIME_S, STILLS, VIDEOS, CancelButton, Cancelled, Host, scroll_to
 from stereoweave.app.frame_panel import FramePanel
 from stereoweave.app.newest_frame import NewestFrame
 from stereoweave.app.notices import (
@@ -93,7 +93,7 @@ class VideoTab:
         self._look = gr.Button("Show one frame", elem_id="video-look")
         self._preview = gr.Button(f"Preview {PREVIEW_S} seconds", variant="primary", elem_id="video-preview")
         self._whole = gr.Button("Convert the whole video", elem_id="video-whole")
-        self._cancel = gr.Button("Cancel", variant="stop", interactive=False, elem_id="video-cancel")
+        self._cancel = CancelButton("video-cancel")
 
     def _connect(self) -> None:
         """Connect events to their handlers."""
@@ -108,16 +108,18 @@ class VideoTab:
         shown = [self._status, self._shown, self._file, self._made, *self._panel.parts]
         begins = [self._preview.click, self._whole.click]
         scroll_to(self._status, [*begins, self._look.click])
-        switch(self._cancel, [*begins, self._look.click], on=True)
+        self._cancel.switch([*begins, self._look.click], on=True)
         events = [
             begin(handler, {*form, self._made}, shown, show_progress_on=self._status, **VIDEOS)
             for begin, handler in zip(begins, (self._preview_video, self._convert_whole), strict=True)
         ]
         events += self._connect_stills(form)
-        connect_cancel(self._cancel, self._status, events)
-        self._cancel.click(self._panel.hide, None, self._panel.parts, concurrency_limit=None, **_AT_ONCE)
+        self._cancel.connect(self._status, events)
+        self._cancel.button.click(
+            self._panel.hide, None, self._panel.parts, concurrency_limit=None, **_AT_ONCE
+        )
         self._panel.output.input(self._show_as, self._panel.output, concurrency_limit=None, **_AT_ONCE)
-        switch(self._cancel, [event.then for event in events], on=False)
+        self._cancel.switch([event.then for event in events], on=False)
 
     def _connect_stills(self, form: set[Any]) -> list[Any]:
         """Show one frame when its button is pressed, and again after a change of its time or the output.
@@ -169,13 +171,15 @@ class VideoTab:
         self._newest[visitor] = newest
         try:
             yield (shown := self._panel.begin(given[self._output]))
-            async with self._host.start(request, work) as job:
+            async with self._host.start(request, work, self._cancel) as job:
                 while not await job.is_done():
                     said = {self._status: format_progress(job.share, job.what)}
                     before, shown = shown, said | self._show_newest(newest)
                     if shown != before:
                         yield shown
                 made = job.task.result()
+        except Cancelled:
+            return
         except (StereoweaveError, OSError) as error:
             yield {self._status: self._wording.format_error(error), **self._panel.hide()}
             return
@@ -242,7 +246,9 @@ class VideoTab:
     ) -> dict[Any, Any]:
         work = partial(convert_still, self._read(given, time_s))
         try:
-            still = await self._host.work(request, work, progress)
+            still = await self._host.work(request, work, progress, self._cancel)
+        except Cancelled:
+            return {self._status: gr.skip()}
         except (StereoweaveError, OSError) as error:
             return {self._status: self._wording.format_error(error), **self._panel.hide()}
         said = format_warnings(still.warnings) + format_notice([_ABOUT_FRAME, *still.facts])

@@ -272,6 +272,31 @@ def test_a_job_cancelled_at_once_shows_no_error(visit, endless_video):
         assert not visit.page.locator("#video-status .error").is_visible()
 
 
+def test_a_job_that_reaches_the_server_after_cancel_does_no_work(visit, endless_video):
+    late = []
+
+    def delay(route) -> None:
+        if not late and endless_video.name in (route.request.post_data or ""):
+            late.append(route)
+        else:
+            route.continue_()
+
+    visit.open("Video")
+    visit.give(video_left=endless_video)
+    visit.page.route("**/queue/join*", delay)
+    visit.page.click("#video-whole")
+    status = visit.page.locator("#video-status")
+    visit.page.click("#video-cancel")
+    status.get_by_text("Cancelled").wait_for()
+    while not late:
+        visit.page.wait_for_timeout(50)
+    late[0].continue_()
+    visit.page.wait_for_timeout(1000)
+    assert status.get_by_text("Cancelled").is_visible()
+    visit.page.click("#video-preview")  # one video at a time
+    status.get_by_text(AT_WORK).wait_for()
+
+
 # By kind: the picture's format, and its width and height.
 STILLS = {
     "side_by_side": ("JPEG", (2 * WIDTH, HEIGHT)),
