@@ -2,6 +2,7 @@
 
 import os
 import subprocess
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -104,41 +105,45 @@ def strip_to_average(kept: Checkpoint) -> Checkpoint:
     return replace(kept, weights=weights, averaged=weights, optimiser={})
 
 
-def average(first: Checkpoint, second: Checkpoint, start: Checkpoint) -> Checkpoint:
-    """Average the weights of two runs that started from `start`, as a starting point for a further run.
+def average(runs: Sequence[Checkpoint]) -> Checkpoint:
+    """Average the weights of runs that descend from the same run.
 
-    The mean of two networks fine-tuned from the same weights is often better than either (Wortsman et al.,
-    "Model soups", ICML 2022). Running variances are averaged too.
+    The mean of networks fine-tuned from the same weights is often better than each of them (Wortsman et al.,
+    "Model soups", ICML 2022). Running variances are averaged too. The result has the recipe of the first run,
+    the hours of the longest, and the origins of all.
 
     Raises:
-        FormatError: If one of the two runs did not start from `start`.
+        FormatError: If a run has no ancestor in common with the first.
     """
-    for run in (first, second):
-        if _list_origins(run.origin) != _list_origins(start.as_origin()):
+    first = runs[0]
+    for run in runs:
+        if not {*_list_ids(first.as_origin())} & {*_list_ids(run.as_origin())}:
             raise FormatError(
-                f"{run.recipe.name}: expected a run that started from {start.recipe.name} after {start.step} "
-                "steps, found a run with a different origin"
+                f"{run.recipe.name}: expected a run that descends from the same run as {first.recipe.name}, "
+                "found a run with a different origin"
             )
-    weights = {name: _midpoint(value, second.averaged[name]) for name, value in first.averaged.items()}
+    ancestors = [past for run in runs for past in run.as_origin()]
+    weights = {name: _mean([run.averaged[name] for run in runs]) for name in first.averaged}
     return replace(
         first,
         weights=weights,
         averaged=weights,
         optimiser={},
         scores={},
-        hours=first.hours + second.hours - start.hours,
-        origin=first.as_origin() + second.as_origin()[len(start.as_origin()) :],
+        hours=max(run.hours for run in runs),
+        origin=tuple(dict(zip(_list_ids(ancestors), ancestors, strict=True)).values()),
     )
 
 
-def _list_origins(origin: tuple[dict[str, Any], ...]) -> list[tuple[str, int]]:
+def _list_ids(origin: Sequence[dict[str, Any]]) -> list[tuple[str, int]]:
     # Recipes are not compared, because old ones lack keys that were added later.
     return [(past["commit"], past["step"]) for past in origin]
 
 
-def _midpoint(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
+def _mean(values: Sequence[torch.Tensor]) -> torch.Tensor:
     # The batch counters of batch norms are integers and cannot be averaged.
-    return (first + second) / 2 if first.is_floating_point() else first
+    first = values[0]
+    return torch.stack(list(values)).double().mean(0).to(first.dtype) if first.is_floating_point() else first
 
 
 def save(checkpoint: Checkpoint, path: Path) -> None:

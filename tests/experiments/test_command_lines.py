@@ -15,6 +15,7 @@ RECIPE = REPOSITORY / "recipes" / "weave_small.toml"
 PAPER_RECIPE = REPOSITORY / "recipes" / "paper" / "experiment.toml"
 EXPERIMENTS = (
     "ablations",
+    "average_weights",
     "failures",
     "first_run",
     "handheld",
@@ -68,6 +69,7 @@ def folder(tmp_path, monkeypatch):
         (f"paper {PAPER_RECIPE} -o runs --report report --only speed", ["only: expected", "'speed'"]),
         ("ablations none.toml -o runs --report rows.csv", ["none.toml", "expected a recipe"]),
         ("stage_costs none.pt -o rows.csv", ["none.pt", "no such checkpoint"]),
+        ("average_weights none.pt -o mean.pt", ["none.pt", "no such checkpoint"]),
         ("paper_worlds none.toml -o rows.csv", ["none.toml", "expected a recipe"]),
         (f"paper_worlds {PAPER_RECIPE} -o rows.csv", ["experiment", "dataset = 'paper_worlds'"]),
         ("paper_sets", ["--report", "--help"]),

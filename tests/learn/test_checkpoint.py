@@ -164,20 +164,22 @@ def gone_on(start, value):
     return replace(start, averaged={"weight": torch.tensor([value])}, origin=start.as_origin(), hours=3.0)
 
 
-def test_the_average_of_two_runs_lies_halfway_and_names_both_and_their_start_once(trained):
+def test_the_average_of_runs_is_their_mean_and_names_all_and_their_start_once(trained):
     start = replace(trained, hours=2.0)
-    first, second = gone_on(start, 1.0), replace(gone_on(start, 4.0), commit="another")
-    found = checkpoint.average(first, second, start)
-    assert found.averaged["weight"].item() == 2.5
+    first, second, third = (
+        replace(gone_on(start, value), commit=commit, hours=hours)
+        for value, commit, hours in ((1.0, "first", 3.0), (4.0, "second", 4.0), (7.0, "third", 3.0))
+    )
+    found = checkpoint.average([first, second, third])
+    assert found.averaged["weight"].item() == 4.0
     assert found.hours == 4.0
-    commits = [run["commit"] for run in found.origin]
-    assert commits == [start.commit, first.commit, "another"]
+    assert [run["commit"] for run in found.origin] == [start.commit, "first", "second", "third"]
 
 
-def test_runs_that_did_not_start_alike_cannot_be_averaged(trained):
-    first = gone_on(trained, 1.0)
+def test_runs_without_an_ancestor_in_common_cannot_be_averaged(trained):
+    stranger = replace(gone_on(trained, 1.0), commit="another", origin=())
     with pytest.raises(FormatError, match="found a run with a different origin"):
-        checkpoint.average(first, trained, trained)
+        checkpoint.average([gone_on(trained, 1.0), stranger])
 
 
 def test_a_file_of_averaged_weights_is_small_and_a_run_can_start_from_it(tmp_path):

@@ -1,0 +1,1 @@
+"""Mean of the weights of several runs of one network."""
