@@ -350,7 +350,7 @@ def test_a_file_for_one_size_takes_smaller_pictures_and_refuses_larger_ones_in_o
 def test_padding_to_a_fixed_size_changes_little(tmp_path):
     pair = read_pair("tests/textured_pair/left.png", "tests/textured_pair/right.png")
     left, right = (np.ascontiguousarray(x[120:280, 200:424]) for x in (pair.left, pair.right))
-    fixed = Matcher(of_fixed_size("small", tmp_path / "fixed.onnx", 240, 320))
+    fixed = Matcher(of_fixed_size("small", tmp_path / "fixed.onnx", 256, 320))
     alone, found = Matcher().estimate(left, right), fixed.estimate(left, right)
     sure = (alone.confidence > 0.9) & ~alone.occluded
     assert sure.mean() > 0.4
@@ -358,4 +358,4 @@ def test_padding_to_a_fixed_size_changes_little(tmp_path):
 
 
 def test_a_matcher_is_shown_by_its_model_range_and_provider():
-    assert repr(Matcher("small")) == "Matcher(small, disparity 0 to 192 px, cpu)"
+    assert repr(Matcher("small")) == "Matcher(small, disparity 0 to 384 px, cpu)"

@@ -52,8 +52,8 @@ def select_float16_nodes(graph: onnx.ModelProto) -> set[str]:
     """Return the names of the nodes to compute in float16.
 
     They are the convolutions, the matrix products that correlate the views, and the nodes between them.
-    Everything that reads or writes a disparity stays in float32, because at 192 px float16 has a resolution
-    of only 1/8 px. The sum of matching scores from which the disparity is read also stays in float32. On
+    Everything that reads or writes a disparity stays in float32, because at 256 px float16 has a resolution
+    of only 1/4 px. The sum of matching scores from which the disparity is read also stays in float32. On
     painted pairs, converting all other nodes as well leaves the mean difference unchanged but increases the
     largest difference.
     """

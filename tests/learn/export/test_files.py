@@ -37,7 +37,7 @@ def test_variants_are_made_from_a_shipped_network(tmp_path, monkeypatch, capsys)
         ("export small -o a.onnx --size 640", "such as 640x480, found '640'"),
         (
             "export small -o a.onnx --size 641x480",
-            "expected multiples of 16 that are at least 32, found 641x480",
+            "expected multiples of 32 that are at least 32, found 641x480",
         ),
         ("export none.onnx -o a.onnx", "none.onnx: expected an ONNX matcher file, found no such file"),
         ("export none -o a.onnx", "none"),

@@ -53,11 +53,11 @@ def test_a_matcher_pads_smaller_pictures_to_the_fixed_size(fixed, rng):
 
 
 @pytest.mark.parametrize(
-    ("width", "height", "suggested"), [(100, 64, "112x64"), (96, 16, "96x32"), (0, 64, "32x64")]
+    ("width", "height", "suggested"), [(100, 64, "128x64"), (96, 16, "96x32"), (0, 64, "32x64")]
 )
 def test_a_size_that_the_network_cannot_take_is_refused(tmp_path, width, height, suggested):
     message = complaint(fixed_size.fix_size, SMALL, tmp_path / "out.onnx", width, height)
-    expected = "size: expected multiples of 16 that are at least 32"
+    expected = "size: expected multiples of 32 that are at least 32"
     assert message.startswith(f"{expected}, found {width}x{height}; ")
     assert suggested in message
     assert list(tmp_path.iterdir()) == []
