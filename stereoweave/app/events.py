@@ -34,19 +34,24 @@ class Cancelled(Exception):
 class CancelButton:
     """Button that cancels a visitor's work of one form.
 
-    Gradio cancels only work that the server knows. The button also stops work that reaches the server later.
+    Gradio cancels only work that the server knows. The button also stops work that reaches the server later,
+    until the visitor begins other work of the form.
 
     Args:
-        name: ID of the button's element.
+        element_id: ID of the button's element.
     """
 
-    def __init__(self, name: str) -> None:
-        self.button = gr.Button("Cancel", variant="stop", interactive=False, elem_id=name)
+    def __init__(self, element_id: str) -> None:
+        self.button = gr.Button("Cancel", variant="stop", interactive=False, elem_id=element_id)
         self._pressed: set[str] = set()
 
     def is_pressed(self, visitor: str) -> bool:
         """Return whether the visitor has cancelled the work that the button was last switched on for."""
         return visitor in self._pressed
+
+    def forget(self, visitor: str) -> None:
+        """Forget a visitor who has left."""
+        self._pressed.discard(visitor)
 
     def connect(self, status: gr.HTML, events: Sequence[Any]) -> None:
         """Let the button cancel these events; it can be pressed while one of them is running or waiting."""
@@ -73,14 +78,14 @@ class CancelButton:
         the trigger is connected to its work.
         """
 
-        def switch(request: gr.Request) -> Any:
+        def answer(request: gr.Request) -> Any:
             if on:
                 self._pressed.discard(str(request.session_hash))
             return gr.update(interactive=on)
 
         for trigger in triggers:
             trigger(
-                switch,
+                answer,
                 None,
                 self.button,
                 show_progress="hidden",

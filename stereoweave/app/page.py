@@ -23,12 +23,15 @@ def make_page(host: Host) -> gr.Blocks:
         gr.HTML(_HEAD, padding=False)
         with gr.Tabs():
             with gr.Tab("Pictures"):
-                PairTab(host)
+                pair_tab = PairTab(host)
             with gr.Tab("Video"):
-                VideoTab(host)
+                video_tab = VideoTab(host)
 
         def stop_work(request: gr.Request) -> None:
-            host.workers.stop(str(request.session_hash))
+            visitor = str(request.session_hash)
+            host.workers.stop(visitor)
+            for button in (pair_tab.cancel, video_tab.cancel):
+                button.forget(visitor)
 
         blocks.unload(stop_work)
     blocks.state_session_capacity = _MOST_SESSIONS

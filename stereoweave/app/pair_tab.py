@@ -59,7 +59,11 @@ _GONE = "This result has expired (results are kept for an hour). Find depth agai
 
 
 class PairTab:
-    """Components and event handlers for a pair; the files to download are kept for an hour."""
+    """Components and event handlers for a pair; the files to download are kept for an hour.
+
+    Attributes:
+        cancel: The form's button that cancels work.
+    """
 
     def __init__(self, host: Host) -> None:
         self._host, self._wording = host, Wording(host.folder, label_of)
@@ -68,6 +72,7 @@ class PairTab:
         with gr.Row():
             with gr.Column(scale=1, min_width=280):
                 self._form = PairForm()
+                self.cancel = self._form.cancel
             with gr.Column(scale=3, min_width=280):
                 self._status = gr.HTML(_EMPTY, elem_id="status", padding=False)
                 with gr.Column(visible=False) as self._results:
@@ -81,7 +86,7 @@ class PairTab:
                 self._build_views()
             with gr.Tab("3-D picture") as self._picture_tab:
                 self._stereo = StereoPictureTab(
-                    self._host, self._wording, self._form.cancel, self._session, self._position
+                    self._host, self._wording, self.cancel, self._session, self._position
                 )
             with gr.Tab("Explore") as self._report_tab:
                 self._report = gr.HTML(elem_id="report", padding=False, min_height=200)
@@ -119,7 +124,7 @@ class PairTab:
         """Connect events to their handlers."""
         form, taken = self._form, [self._status, *self._file_parts]
         scroll_to(self._status, [form.find.click, form.sample.click])
-        form.cancel.switch([form.find.click, form.sample.click], on=True)
+        self.cancel.switch([form.find.click, form.sample.click], on=True)
         sampled = form.sample.click(form.fill_in_sample, None, form.fields, api_visibility="private")
         long, ends = [], []
         for begin in (form.find.click, sampled.then):
@@ -137,8 +142,8 @@ class PairTab:
             long += [found, written]
             ends.append(written.then)
         made = [self._connect_report(), *self._stereo.connect(self._picture_tab)]
-        form.cancel.connect(self._status, [*long, *made])
-        form.cancel.switch([*ends, *(event.then for event in made)], on=False)
+        self.cancel.connect(self._status, [*long, *made])
+        self.cancel.switch([*ends, *(event.then for event in made)], on=False)
         self._connect_views()
 
     def _connect_report(self) -> Any:
@@ -147,7 +152,7 @@ class PairTab:
         Returns:
             The event that shows it.
         """
-        self._form.cancel.switch([self._report_tab.select], on=True)
+        self.cancel.switch([self._report_tab.select], on=True)
         return self._report_tab.select(
             self._show_report, self._session, self._report, show_progress_on=self._report, **MATCHING
         )
@@ -192,9 +197,7 @@ class PairTab:
         """Match the given pictures, and return the page's new content: the result or an error."""
         try:
             uploads = self._form.read(given, self._host.provider)
-            result = await self._host.work(
-                request, partial(match_uploads, uploads), progress, self._form.cancel
-            )
+            result = await self._host.work(request, partial(match_uploads, uploads), progress, self.cancel)
             progress(0.6, desc="showing")
             # Otherwise, all other visitors would wait.
             shown = await asyncio.to_thread(self._open_result, result, given[self._position])
@@ -222,7 +225,7 @@ class PairTab:
             return {self._files: gr.skip()}
         work = partial(write_all, session.result, session.folder)
         try:
-            written = await self._host.work(request, work, progress, self._form.cancel)
+            written = await self._host.work(request, work, progress, self.cancel)
         except Cancelled:
             return {self._status: gr.skip()}
         except (StereoweaveError, OSError) as error:
@@ -288,7 +291,7 @@ class PairTab:
         if not file.exists():
             work = partial(write_shown_report, session.result, file)
             try:
-                await self._host.work(request, work, progress, self._form.cancel)
+                await self._host.work(request, work, progress, self.cancel)
             except Cancelled:
                 return ""
             except (StereoweaveError, OSError) as error:

@@ -50,7 +50,11 @@ label_of = partial(name_setting, _LABELS)
 
 
 class VideoTab:
-    """Components and event handlers for a video; the result is kept for an hour."""
+    """Components and event handlers for a video; the result is kept for an hour.
+
+    Attributes:
+        cancel: The form's button that cancels work.
+    """
 
     def __init__(self, host: Host) -> None:
         self._host, self._wording = host, Wording(host.folder, label_of)
@@ -93,7 +97,7 @@ class VideoTab:
         self._look = gr.Button("Show one frame", elem_id="video-look")
         self._preview = gr.Button(f"Preview {PREVIEW_S} seconds", variant="primary", elem_id="video-preview")
         self._whole = gr.Button("Convert the whole video", elem_id="video-whole")
-        self._cancel = CancelButton("video-cancel")
+        self.cancel = CancelButton("video-cancel")
 
     def _connect(self) -> None:
         """Connect events to their handlers."""
@@ -108,18 +112,18 @@ class VideoTab:
         shown = [self._status, self._shown, self._file, self._made, *self._panel.parts]
         begins = [self._preview.click, self._whole.click]
         scroll_to(self._status, [*begins, self._look.click])
-        self._cancel.switch([*begins, self._look.click], on=True)
+        self.cancel.switch([*begins, self._look.click], on=True)
         events = [
             begin(handler, {*form, self._made}, shown, show_progress_on=self._status, **VIDEOS)
             for begin, handler in zip(begins, (self._preview_video, self._convert_whole), strict=True)
         ]
         events += self._connect_stills(form)
-        self._cancel.connect(self._status, events)
-        self._cancel.button.click(
+        self.cancel.connect(self._status, events)
+        self.cancel.button.click(
             self._panel.hide, None, self._panel.parts, concurrency_limit=None, **_AT_ONCE
         )
         self._panel.output.input(self._show_as, self._panel.output, concurrency_limit=None, **_AT_ONCE)
-        self._cancel.switch([event.then for event in events], on=False)
+        self.cancel.switch([event.then for event in events], on=False)
 
     def _connect_stills(self, form: set[Any]) -> list[Any]:
         """Show one frame when its button is pressed, and again after a change of its time or the output.
@@ -171,7 +175,7 @@ class VideoTab:
         self._newest[visitor] = newest
         try:
             yield (shown := self._panel.begin(given[self._output]))
-            async with self._host.start(request, work, self._cancel) as job:
+            async with self._host.start(request, work, self.cancel) as job:
                 while not await job.is_done():
                     said = {self._status: format_progress(job.share, job.what)}
                     before, shown = shown, said | self._show_newest(newest)
@@ -246,7 +250,7 @@ class VideoTab:
     ) -> dict[Any, Any]:
         work = partial(convert_still, self._read(given, time_s))
         try:
-            still = await self._host.work(request, work, progress, self._cancel)
+            still = await self._host.work(request, work, progress, self.cancel)
         except Cancelled:
             return {self._status: gr.skip()}
         except (StereoweaveError, OSError) as error:

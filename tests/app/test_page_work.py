@@ -288,7 +288,8 @@ def test_a_job_that_reaches_the_server_after_cancel_does_no_work(visit, endless_
     status = visit.page.locator("#video-status")
     visit.page.click("#video-cancel")
     status.get_by_text("Cancelled").wait_for()
-    while not late:
+    deadline_s = time.monotonic() + WAIT_S
+    while not late and time.monotonic() < deadline_s:
         visit.page.wait_for_timeout(50)
     late[0].continue_()
     visit.page.wait_for_timeout(1000)
