@@ -20,8 +20,8 @@ def average_weights(
     with require_train_extra():
         from experiments.average_weights.averaging import average_and_score
         from stereoweave.learn import checkpoint
-    mean = average_and_score(checkpoints, pairs)
     make_parent_folder(out)
+    mean = average_and_score(checkpoints, pairs)
     checkpoint.save(mean, out)
     typer.echo(f"{out}: mean of {len(checkpoints)} networks, EPE {mean.scores['epe_px']:.3f} px")
 

@@ -22,7 +22,7 @@ def average_and_score(checkpoints: Sequence[Path], pairs: Path) -> checkpoint.Ch
     Raises:
         FormatError: As for `checkpoint.load` and `checkpoint.average`.
     """
-    mean = checkpoint.average([checkpoint.load(file) for file in checkpoints])
+    mean = checkpoint.strip_to_average(checkpoint.average([checkpoint.load(file) for file in checkpoints]))
     _, held_out = open_sources(replace(mean.recipe, mix=()), pairs)
     scores = validate(mean.build_averaged(), cache_pairs(held_out, Console(stderr=True)), torch.device("cpu"))
-    return replace(checkpoint.strip_to_average(mean), scores=scores)
+    return replace(mean, scores=scores)

@@ -113,10 +113,15 @@ def average(runs: Sequence[Checkpoint]) -> Checkpoint:
     the hours of the longest, and the origins of all.
 
     Raises:
-        FormatError: If a run has no ancestor in common with the first.
+        FormatError: If a run is of another network than the first, or has no ancestor in common with it.
     """
     first = runs[0]
     for run in runs:
+        if _list_shapes(run.averaged) != _list_shapes(first.averaged):
+            raise FormatError(
+                f"{run.recipe.name}: expected a {first.recipe.model} as in {first.recipe.name}, "
+                f"found a {run.recipe.model} or other sizes"
+            )
         if not {*_list_ids(first.as_origin())} & {*_list_ids(run.as_origin())}:
             raise FormatError(
                 f"{run.recipe.name}: expected a run that descends from the same run as {first.recipe.name}, "
@@ -135,9 +140,13 @@ def average(runs: Sequence[Checkpoint]) -> Checkpoint:
     )
 
 
-def _list_ids(origin: Sequence[dict[str, Any]]) -> list[tuple[str, int]]:
-    # Recipes are not compared, because old ones lack keys that were added later.
-    return [(past["commit"], past["step"]) for past in origin]
+def _list_shapes(weights: Weights) -> dict[str, torch.Size]:
+    return {name: value.shape for name, value in weights.items()}
+
+
+def _list_ids(origin: Sequence[dict[str, Any]]) -> list[tuple[str, int, str, int]]:
+    # Whole recipes are not compared, because old ones lack keys that were added later.
+    return [(past["commit"], past["step"], past["recipe"]["name"], past["recipe"]["seed"]) for past in origin]
 
 
 def _mean(values: Sequence[torch.Tensor]) -> torch.Tensor:

@@ -176,10 +176,17 @@ def test_the_average_of_runs_is_their_mean_and_names_all_and_their_start_once(tr
     assert [run["commit"] for run in found.origin] == [start.commit, "first", "second", "third"]
 
 
-def test_runs_without_an_ancestor_in_common_cannot_be_averaged(trained):
-    stranger = replace(gone_on(trained, 1.0), commit="another", origin=())
+@pytest.mark.parametrize("change", [{"commit": "another"}, {"recipe": replace(RECIPE, seed=9)}])
+def test_runs_without_an_ancestor_in_common_cannot_be_averaged(trained, change):
+    stranger = replace(gone_on(trained, 1.0), origin=(), **change)
     with pytest.raises(FormatError, match="found a run with a different origin"):
-        checkpoint.average([gone_on(trained, 1.0), stranger])
+        checkpoint.average([replace(gone_on(trained, 1.0), origin=()), stranger])
+
+
+def test_networks_of_different_shapes_cannot_be_averaged(trained):
+    wider = replace(gone_on(trained, 1.0), averaged={"weight": torch.zeros(2)})
+    with pytest.raises(FormatError, match="expected a weave_small"):
+        checkpoint.average([gone_on(trained, 1.0), wider])
 
 
 def test_a_file_of_averaged_weights_is_small_and_a_run_can_start_from_it(tmp_path):
