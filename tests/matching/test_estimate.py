@@ -395,10 +395,10 @@ def test_a_pair_is_scaled_down_no_more_than_its_range_requires(matcher, rng, mon
         return estimate_many(matcher, pairs, **options)
 
     monkeypatch.setattr(Matcher, "estimate_many", noted)
-    match(matcher, flat(rng, 37), MatchOptions(range_px=(-300, 400)))
-    # 700 px must fit into the 380 px that the network covers well: 480x160 px become 261x87, and the least
-    # disparity becomes -163.1 px.
-    assert seen == [(87, 261 + 164, 3)]
+    match(matcher, flat(rng, 37), MatchOptions(range_px=(-100, 300)))
+    # 400 px must fit into the 252 px that the network covers well: 480x160 px become 302x101, and the least
+    # disparity becomes -62.9 px.
+    assert seen == [(101, 302 + 63, 3)]
 
 
 @pytest.mark.parametrize("options", [MatchOptions(), MatchOptions(range_px=(-8, 100), refined=True)])

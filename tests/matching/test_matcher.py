@@ -358,4 +358,4 @@ def test_padding_to_a_fixed_size_changes_little(tmp_path):
 
 
 def test_a_matcher_is_shown_by_its_model_range_and_provider():
-    assert repr(Matcher("small")) == "Matcher(small, disparity 0 to 384 px, cpu)"
+    assert repr(Matcher("small")) == "Matcher(small, disparity 0 to 256 px, cpu)"

@@ -33,6 +33,9 @@ HALF = replace(
     neighbours=4,
     wider=0,
 )
+# Training pairs reach 188 px. Pairs with surfaces beyond 250 px are matched better at a smaller size (lab
+# notebook, 2026-11-27).
+_RELIABLE_PX = 256
 # Deviations from the local mean beyond this, in half-resolution pixels, all mean another surface.
 _LARGEST_DEPARTURE = 8.0
 
@@ -64,8 +67,8 @@ class WeaveHalfNet(WeaveNet):
     With HALF it takes as long as a WeaveNet of size SMALL. Its training can start from the weights of a
     WeaveNet.
 
-    The sides of the images must be multiples of 32, or of 64 if `size` has a context at 1/32 resolution. The
-    disparity range is twice as large as that of a WeaveNet.
+    The sides of the images must be multiples of 32, or of 64 if `size` has a context at 1/32 resolution. Its
+    levels reach twice as far as those of a WeaveNet; its range ends where training pairs make it reliable.
 
     Size, and cost for both views at 640x480: 761,602 parameters and 2.84 G multiply-adds with HALF.
     """
@@ -80,7 +83,7 @@ class WeaveHalfNet(WeaveNet):
 
     @property
     def max_disparity_px(self) -> int:
-        return 2 * super().max_disparity_px
+        return min(2 * super().max_disparity_px, _RELIABLE_PX)
 
     @property
     def refinements(self) -> tuple[Refinement, ...]:

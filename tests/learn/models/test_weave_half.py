@@ -75,8 +75,9 @@ def test_the_right_view_is_the_left_view_of_the_mirrored_pair():
     assert (left_px - right_px).abs().max() > 0.1
 
 
-def test_forty_eight_levels_reach_384_px():
-    assert untrained("weave_half").max_disparity_px == 384
+def test_the_range_ends_at_256_px_or_with_the_levels():
+    assert untrained("weave_half").max_disparity_px == 256
+    assert WeaveHalfNet(HALF, levels=16).max_disparity_px == 128
 
 
 def test_the_network_overfits_one_pair():
