@@ -187,7 +187,7 @@ def test_some_wrong_matches_do_no_harm(wall, rng):
 @pytest.mark.parametrize(
     "nothing",
     [
-        {"confidence": np.full((120, 160), 0.4, np.float32)},
+        {"confidence": np.full((120, 160), 0.59, np.float32)},
         {"occluded": np.ones((120, 160), bool)},
         {"disparity_px": np.full((120, 160), 160, np.float32)},
     ],
