@@ -18,7 +18,7 @@ column, row, other_column, other_row = map(int, sys.argv[1:] or (262, 225, 390, 
 pair = add_camera(read_pair(HERE / "left.png", HERE / "right.png"), HERE / "calib.txt")
 assert pair.camera is not None
 found = distance(
-    sw.estimate(pair.left, pair.right),
+    sw.estimate(pair.left, pair.right, model="base"),
     pair.camera,
     (column, row),
     (other_column, other_row),

@@ -29,7 +29,7 @@ from stereoweave.learn.data.silhouettes import (
     soften,
 )
 
-NETWORK_REACH_PX = 188  # largest disparity that a network can find
+NETWORK_REACH_PX = 188  # largest disparity that a WeaveNet at the full resolution can find
 
 
 @dataclass(frozen=True, kw_only=True)
