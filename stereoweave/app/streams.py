@@ -12,7 +12,7 @@ _STREAM, _JOIN = f"{API}/queue/data", f"{API}/queue/join"
 _END = b'data: {"msg":"close_stream"'
 # Longer than any message takes. Behind a proxy that hides disconnections, each stream stays open this long
 # after its end.
-_PATIENCE_S = 2.0
+_PATIENCE_S = 5.0
 
 
 class EndedStreams:

@@ -160,7 +160,7 @@ def test_two_visitors_work_at_once_and_cancelling_ends_one_job(server, browser, 
         patient.give(**pair)
         patient.page.get_by_label("fast").check()
         assert f"{WIDTH}×{HEIGHT} px, matched in" in patient.find()
-        assert not patient.page.locator("#cancel").is_enabled()
+        patient.page.locator("#cancel:disabled").wait_for()
 
 
 def test_after_cancelling_the_result_before_stays(visit, pair, large_pair):
