@@ -82,7 +82,7 @@ def test_a_teacher_of_another_kind_or_with_other_levels_is_named(tmp_path):
     assert message == f"tiny: teacher: expected 24 levels to 96 px as in weave_small, {found}"
     recipe = recipe_of("weave_half", teacher=path)
     message = complaint(build_objective, recipe, untrained("weave_half"))
-    assert message == f"tiny: teacher: expected 48 levels to 384 px as in weave_half, {found}"
+    assert message == f"tiny: teacher: expected 48 levels to 256 px as in weave_half, {found}"
 
 
 def test_crops_must_fit_the_teacher(tmp_path):
