@@ -326,8 +326,8 @@ def _refined_disparity_px(
 ) -> Float[Tensor, "b 1 h w"]:
     """Return the mean candidate after local aggregation, twice each of costs and of likelihoods."""
     before, after = local
-    likelihood = (-aggregate_locally(aggregate_locally(costs, before), before)).softmax(1)
-    likelihood = aggregate_locally(aggregate_locally(likelihood, after), after)
+    likelihood = (-aggregate_locally(costs, before, times=2)).softmax(1)
+    likelihood = aggregate_locally(likelihood, after, times=2)
     candidates_px = torch.arange(costs.shape[1], dtype=costs.dtype, device=costs.device).view(1, -1, 1, 1)
     return (F.normalize(likelihood, p=1, dim=1) * candidates_px).sum(1, keepdim=True)
 

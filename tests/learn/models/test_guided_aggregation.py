@@ -6,7 +6,13 @@ import torch
 import torch.nn.functional as F
 from plain_guided_aggregation import plain_local, plain_semi_global
 
-from stereoweave.learn.models.guided_aggregation import aggregate_locally, aggregate_semi_globally
+from stereoweave.learn.models.guided_aggregation import (
+    aggregate_locally,
+    aggregate_semi_globally,
+    filter_in_torch,
+    follow_in_torch,
+)
+from stereoweave.learn.models.guided_functions import FilterWindows, FollowPaths
 
 torch.set_num_threads(1)
 
@@ -60,6 +66,41 @@ def test_local_aggregation_equals_the_written_out_one(size):
     shares = F.normalize(weights, p=1, dim=1).view(2, 3, 5, 5, *size[1:])
     expected = [plain_local(*both) for both in zip(costs.numpy(), shares.numpy(), strict=True)]
     np.testing.assert_allclose(aggregate_locally(costs, weights), expected, atol=1e-5)
+
+
+def results_and_gradients(function, *given):
+    """Return a function's result, and the gradients of its random projection, of all tensors given."""
+    torch.manual_seed(1)
+    inputs = [value.clone().requires_grad_() if torch.is_tensor(value) else value for value in given]
+    result = function(*inputs)
+    (result * torch.randn_like(result)).sum().backward()
+    return [result.detach(), *(value.grad for value in inputs if torch.is_tensor(value))]
+
+
+@pytest.mark.parametrize("backwards", [False, True])
+@pytest.mark.parametrize("size", [(4, 7, 6), (1, 3, 4), (2, 1, 3), (5, 4, 1)])
+def test_numba_follows_paths_as_pytorch_does(size, backwards):
+    torch.manual_seed(0)
+    shares = F.normalize(torch.randn(2, 3, 5, *size[1:]), p=1, dim=2)  # else, costs grow along the path
+    given = torch.randn(2, 3, *size), shares, backwards
+    compiled = results_and_gradients(FollowPaths.apply, *given)
+    torch.testing.assert_close(compiled, results_and_gradients(follow_in_torch, *given))
+
+
+@pytest.mark.parametrize("size", [(4, 7, 6), (1, 3, 4), (2, 1, 1)])
+def test_numba_filters_windows_as_pytorch_does(size):
+    torch.manual_seed(0)
+    levels, height, width = size
+    given = torch.randn(2, levels + 2, height + 4, width + 4), torch.randn(2, 3, 5, 5, height, width)
+    compiled = results_and_gradients(FilterWindows.apply, *given)
+    torch.testing.assert_close(compiled, results_and_gradients(filter_in_torch, *given))
+
+
+def test_local_aggregation_twice_is_that_of_the_first_result():
+    torch.manual_seed(0)
+    costs, weights = torch.randn(1, 3, 4, 5), torch.randn(1, 75, 4, 5)
+    once = aggregate_locally(costs, weights)
+    torch.testing.assert_close(aggregate_locally(costs, weights, times=2), aggregate_locally(once, weights))
 
 
 def test_equal_local_weights_keep_a_constant_volume_and_spread_a_single_cost():
