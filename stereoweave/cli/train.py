@@ -13,7 +13,9 @@ from stereoweave.errors import StereoweaveError
 
 @shows_steps
 def train(
-    recipe: Annotated[Path, typer.Argument(help="Recipe in TOML, such as recipes/weave_small.toml.")],
+    recipe: Annotated[
+        Path, typer.Argument(help="Recipe in TOML, such as recipes/ablations/weave_small.toml.")
+    ],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the run: a new one, or one to resume.")],
 ) -> None:
     """Train the network of a recipe, or resume an interrupted run."""
