@@ -6,8 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean, median
 
-import numpy as np
-
 from experiments.paper.figures import draw_validation
 from experiments.paper_transfer.trials import SCRATCH, TUNED
 from experiments.trial import Trial
@@ -123,9 +121,7 @@ def draw_curves(trials: Sequence[Trial], runs: Path, picture: Path) -> None:
         for seed in dict.fromkeys(trial.recipe.seed for trial in trials):
             of_scenes = [curve for key, curve in curves.items() if key[1:] == (setting, seed)]
             points = zip(*of_scenes, strict=True)
-            lines.append(
-                [(int(at[0]["step"]), float(np.mean([one["squared_error"] for one in at]))) for at in points]
-            )
+            lines.append([(int(at[0]["step"]), fmean(one["squared_error"] for one in at)) for at in points])
     draw_validation(picture, drawn)
 
 
