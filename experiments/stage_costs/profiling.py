@@ -31,10 +31,10 @@ TOTAL = "total"
 _STAGES = {
     "to_match": "correlation",
     "weights": "upsampling",
-    "to_match_half": "matching at 1/2",
+    "to_match_half": "local matching",
     "to_half": "refinement",
     "stem": "encoder",
-    "to_match_stem": "matching at 1/2",
+    "to_match_stem": "local matching",
     "enlargement": "refinement",
 }
 # Stages of operations between the parts of a module, by that module ("" for the network itself) and by the
@@ -46,7 +46,7 @@ _STAGES_BETWEEN = {
     ("", "completion"): "completion",
     ("", "propagation"): "upsampling",
     ("", "refinement"): "upsampling",
-    ("refinement", "to_half"): "matching at 1/2",
+    ("refinement", "to_half"): "local matching",
 }
 # Kernels that only change shapes, and move no data.
 _VIEWS = {"Reshape", "Squeeze", "Unsqueeze", "Flatten", "Identity"}

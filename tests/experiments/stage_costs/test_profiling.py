@@ -83,7 +83,7 @@ def test_an_operation_belongs_to_the_stage_of_its_module_or_of_what_ran_before_i
         "coarse": "disparity from scores",
         "handed": "refinement",
         "shuffled": "refinement",
-        "looked_up": "matching at 1/2",
+        "looked_up": "local matching",
         "joined": "refinement",
         "fine": "refinement",
         "disparity": "upsampling",
@@ -162,7 +162,7 @@ def test_the_product_is_the_peak_and_the_stages_come_in_order_with_their_total(r
         "aggregation",
         "disparity from scores",
         "upsampling",
-        "matching at 1/2",
+        "local matching",
         "refinement",
     ]
 
