@@ -110,12 +110,15 @@ def _find_inner(
 ) -> Bool[np.ndarray, "h2 w2"]:
     """Return the mask of pixels whose entire window has content.
 
-    Other windows contain the border of the content, which is not texture.
+    Other windows contain the border of the content or of the picture, which is not texture.
     """
-    if seen is None:
-        return np.ones(small.shape, bool)
-    window = np.ones((_WINDOW_ROWS + 2, _WINDOW_COLUMNS + 2), np.uint8)
-    return cv2.erode(_small_mask(seen, small).astype(np.uint8), window) > 0
+    inner = np.ones(small.shape, bool)
+    if seen is not None:
+        window = np.ones((_WINDOW_ROWS + 2, _WINDOW_COLUMNS + 2), np.uint8)
+        inner = cv2.erode(_small_mask(seen, small).astype(np.uint8), window) > 0
+    beside = _WINDOW_COLUMNS // 2
+    inner[:, :beside] = inner[:, -beside:] = False
+    return inner
 
 
 def _match_rows(

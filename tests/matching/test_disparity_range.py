@@ -63,6 +63,16 @@ def test_swapped_sides_have_negative_disparities(rng):
     assert -FAR_PX + 1 <= high_px <= -FAR_PX + 6
 
 
+@pytest.mark.parametrize("side", [np.s_[:, :1], np.s_[:, -1:]])
+def test_the_border_of_the_picture_is_not_a_match(rng, side):
+    pair = scene(rng)
+    for photo in (pair.left, pair.right):
+        photo[side] = 0
+    low_px, _ = find_range(pair)
+    assert abs(low_px - FAR_PX) < 1
+    assert not goes_beyond(pair, EVERYWHERE, (FAR_PX - 1, NEAR_PX + 1))
+
+
 def test_unrelated_and_plain_pictures_have_no_range(rng):
     left, right = soft_noise(rng, (240, 320)), soft_noise(rng, (240, 320))
     assert find_range(StereoPair(left=left, right=right)) is None
