@@ -1,11 +1,12 @@
 """Long work of the page as Gradio's events, which a button cancels and a closed tab ends."""
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import gradio as gr
@@ -23,6 +24,9 @@ MATCHING: dict[str, Any] = {"concurrency_id": "matching", "concurrency_limit": 2
 VIDEOS: dict[str, Any] = {"concurrency_id": "videos", "concurrency_limit": 1, "api_visibility": "private"}
 # One frame of a video takes seconds, so it does not wait for another visitor's video.
 STILLS: dict[str, Any] = {"concurrency_id": "stills", "concurrency_limit": 1, "api_visibility": "private"}
+# Settings of the events that are answered at once.
+AT_ONCE: dict[str, Any] = {"show_progress": "hidden", "concurrency_limit": None, "api_visibility": "private"}
+_NOTHING: Mapping[Any, Any] = MappingProxyType({})
 _LOOK_S = 0.2
 _CANCELLED = "Cancelled. Change what you like, and start again. A result below is from before."
 
@@ -53,45 +57,51 @@ class CancelButton:
         """Forget a visitor who has left."""
         self._pressed.discard(visitor)
 
-    def connect(self, status: gr.HTML, events: Sequence[Any]) -> None:
-        """Let the button cancel these events; it can be pressed while one of them is running or waiting."""
-
-        def press(request: gr.Request) -> tuple[str, Any]:
-            self._pressed.add(str(request.session_hash))
-            said = f'<div class="cancelled">{format_notice([_CANCELLED])}</div>'
-            return said, gr.update(interactive=False)
-
-        self.button.click(
-            press,
-            None,
-            [status, self.button],
-            cancels=list(events),
-            concurrency_limit=None,
-            api_visibility="private",
-        )
-        scroll_to(status, [self.button.click])
-
-    def switch(self, triggers: Sequence[Any], *, on: bool) -> None:
-        """Switch the button on or off at these triggers.
+    def switch_on(self, triggers: Sequence[Any]) -> None:
+        """Switch the button on at these triggers.
 
         A browser runs the events of a trigger one after the other, so the button must be switched on before
         the trigger is connected to its work.
         """
 
-        def answer(request: gr.Request) -> Any:
-            if on:
-                self._pressed.discard(str(request.session_hash))
-            return gr.update(interactive=on)
+        def begin(request: gr.Request) -> Any:
+            self._pressed.discard(str(request.session_hash))
+            return gr.update(interactive=True)
 
         for trigger in triggers:
-            trigger(
-                answer,
-                None,
-                self.button,
-                show_progress="hidden",
-                concurrency_limit=None,
-                api_visibility="private",
-            )
+            trigger(begin, None, self.button, **AT_ONCE)
+
+    def connect(
+        self,
+        status: gr.HTML,
+        events: Sequence[Any],
+        ends: Sequence[Any],
+        others: Mapping[Any, Any] = _NOTHING,
+    ) -> None:
+        """Let the button cancel these events; it can be pressed while one of them is running or waiting.
+
+        Args:
+            status: Where it says that the work is cancelled.
+            events: The events to cancel.
+            ends: Triggers at the end of the work, whether it is cancelled or not.
+            others: Content of other parts of the page after cancelling.
+        """
+        said = f'<div class="cancelled">{format_notice([_CANCELLED])}</div>'
+        off, cancelled = {self.button: gr.update(interactive=False)}, {status: said, **others}
+
+        def press(request: gr.Request) -> dict[Any, Any]:
+            self._pressed.add(str(request.session_hash))
+            return off | cancelled
+
+        def end(request: gr.Request) -> dict[Any, Any]:
+            # Again, because content that the work sent just before may have arrived after that of `press`.
+            return off | (cancelled if self.is_pressed(str(request.session_hash)) else {})
+
+        parts = [self.button, *cancelled]
+        self.button.click(press, None, parts, cancels=list(events), **AT_ONCE)
+        scroll_to(status, [self.button.click])
+        for trigger in ends:
+            trigger(end, None, parts, **AT_ONCE)
 
 
 @dataclass(frozen=True)
@@ -153,11 +163,12 @@ class Job:
         """Wait for a short time, and return whether the work is done or has failed.
 
         Raises:
-            Cancelled: If the visitor has cancelled it.
+            Cancelled: If the visitor has cancelled it, before or meanwhile.
         """
+        if not self._is_cancelled():
+            await asyncio.wait([self.task], timeout=_LOOK_S)
         if self._is_cancelled():
             raise Cancelled
-        await asyncio.wait([self.task], timeout=_LOOK_S)
         return self.task.done()
 
 

@@ -124,7 +124,7 @@ class PairTab:
         """Connect events to their handlers."""
         form, taken = self._form, [self._status, *self._file_parts]
         scroll_to(self._status, [form.find.click, form.sample.click])
-        self.cancel.switch([form.find.click, form.sample.click], on=True)
+        self.cancel.switch_on([form.find.click, form.sample.click])
         sampled = form.sample.click(form.fill_in_sample, None, form.fields, api_visibility="private")
         long, ends = [], []
         for begin in (form.find.click, sampled.then):
@@ -142,8 +142,7 @@ class PairTab:
             long += [found, written]
             ends.append(written.then)
         made = [self._connect_report(), *self._stereo.connect(self._picture_tab)]
-        self.cancel.connect(self._status, [*long, *made])
-        self.cancel.switch([*ends, *(event.then for event in made)], on=False)
+        self.cancel.connect(self._status, [*long, *made], [*ends, *(event.then for event in made)])
         self._connect_views()
 
     def _connect_report(self) -> Any:
@@ -152,7 +151,7 @@ class PairTab:
         Returns:
             The event that shows it.
         """
-        self.cancel.switch([self._report_tab.select], on=True)
+        self.cancel.switch_on([self._report_tab.select])
         return self._report_tab.select(
             self._show_report, self._session, self._report, show_progress_on=self._report, **MATCHING
         )

@@ -89,7 +89,7 @@ class StereoPictureTab:
             The events that make it.
         """
         begins = [tab.select, self._kind.input, self._size.input, self._crops.input]
-        self._cancel.switch(begins, on=True)
+        self._cancel.switch_on(begins)
         asked: set[Any] = {self._session, self._kind, self._size, self._crops, self._position}
         self._kind.focus(None, None, None, js=_SHOW_CHOICE, api_visibility="private")
         self._kind.input(

@@ -10,7 +10,16 @@ from typing import Any
 
 import gradio as gr
 
-from stereoweave.app.events import LIFETIME_S, STILLS, VIDEOS, CancelButton, Cancelled, Host, scroll_to
+from stereoweave.app.events import (
+    AT_ONCE,
+    LIFETIME_S,
+    STILLS,
+    VIDEOS,
+    CancelButton,
+    Cancelled,
+    Host,
+    scroll_to,
+)
 from stereoweave.app.frame_panel import FramePanel
 from stereoweave.app.newest_frame import NewestFrame
 from stereoweave.app.notices import (
@@ -38,8 +47,6 @@ this page open.</li>
 _ABOUT_FRAME = (
     "One frame, converted as the video would be. Move the slider below it, or choose something else to make."
 )
-# Settings of events that are answered at once.
-_AT_ONCE: dict[str, Any] = {"show_progress": "hidden", "api_visibility": "private"}
 _LABELS = {
     "format": "Layout of a single video",
     "model": "Quality",
@@ -112,18 +119,14 @@ class VideoTab:
         shown = [self._status, self._shown, self._file, self._made, *self._panel.parts]
         begins = [self._preview.click, self._whole.click]
         scroll_to(self._status, [*begins, self._look.click])
-        self.cancel.switch([*begins, self._look.click], on=True)
+        self.cancel.switch_on([*begins, self._look.click])
         events = [
             begin(handler, {*form, self._made}, shown, show_progress_on=self._status, **VIDEOS)
             for begin, handler in zip(begins, (self._preview_video, self._convert_whole), strict=True)
         ]
         events += self._connect_stills(form)
-        self.cancel.connect(self._status, events)
-        self.cancel.button.click(
-            self._panel.hide, None, self._panel.parts, concurrency_limit=None, **_AT_ONCE
-        )
-        self._panel.output.input(self._show_as, self._panel.output, concurrency_limit=None, **_AT_ONCE)
-        self.cancel.switch([event.then for event in events], on=False)
+        self.cancel.connect(self._status, events, [event.then for event in events], self._panel.hide())
+        self._panel.output.input(self._show_as, self._panel.output, **AT_ONCE)
 
     def _connect_stills(self, form: set[Any]) -> list[Any]:
         """Show one frame when its button is pressed, and again after a change of its time or the output.
