@@ -6,6 +6,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from stereoweave.learn.models import guided_kernels
 
@@ -27,6 +28,7 @@ class FollowPaths(torch.autograd.Function):
         return aggregated
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, None]:
         """Return the gradients of the costs and of the weights."""
         costs, weights, aggregated = ctx.saved_tensors
@@ -53,6 +55,7 @@ class FilterWindows(torch.autograd.Function):
         return filtered
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
         """Return the gradients of the padded costs and of the shares."""
         padded, shares = ctx.saved_tensors
@@ -62,6 +65,6 @@ class FilterWindows(torch.autograd.Function):
 
 
 def _run(kernel: Callable[..., None], *volumes: Tensor) -> None:
-    """Run a kernel for each element of the first axis, in PyTorch's number of threads."""
+    """Run a kernel for each element of the first axis, in at most PyTorch's number of threads."""
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:
         list(pool.map(kernel, *(volume.detach().numpy() for volume in volumes)))

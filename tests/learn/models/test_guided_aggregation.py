@@ -135,3 +135,19 @@ def test_both_aggregations_have_the_gradients_of_their_differences():
             ]
             difference = ((ends[0] - ends[1]).double() * onto).sum() / 2e-3
             assert difference.item() == pytest.approx((gradient * towards).sum().item(), rel=0.02, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("aggregate", "costs", "weights"),
+    [
+        (aggregate_semi_globally, torch.rand(1, 2, 3, 4, 5), torch.rand(1, 40, 4, 5)),
+        (aggregate_locally, torch.rand(1, 3, 4, 5), torch.rand(1, 75, 4, 5)),
+    ],
+)
+def test_costs_of_16_bits_are_aggregated_in_float32_and_have_no_second_derivative(aggregate, costs, weights):
+    given = costs.bfloat16().requires_grad_(), weights.requires_grad_()
+    aggregated = aggregate(*given)
+    assert aggregated.dtype == torch.float32
+    (gradient,) = torch.autograd.grad(aggregated.square().sum(), given[:1], create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        gradient.sum().backward()
