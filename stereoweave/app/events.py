@@ -81,7 +81,7 @@ class CancelButton:
         """Let the button cancel these events; it can be pressed while one of them is running or waiting.
 
         Args:
-            status: Where it says that the work is cancelled.
+            status: Shows that the work is cancelled.
             events: The events to cancel.
             ends: Triggers at the end of the work, whether it is cancelled or not.
             others: Content of other parts of the page after cancelling.
@@ -163,7 +163,7 @@ class Job:
         """Wait for a short time, and return whether the work is done or has failed.
 
         Raises:
-            Cancelled: If the visitor has cancelled it, before or meanwhile.
+            Cancelled: If the visitor has cancelled it, before the call or during it.
         """
         if not self._is_cancelled():
             await asyncio.wait([self.task], timeout=_LOOK_S)

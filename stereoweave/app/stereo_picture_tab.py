@@ -7,7 +7,7 @@ from uuid import uuid4
 
 import gradio as gr
 
-from stereoweave.app.events import MATCHING, CancelButton, Cancelled, Host
+from stereoweave.app.events import AT_ONCE, MATCHING, CancelButton, Cancelled, Host
 from stereoweave.app.notices import Wording, format_frame, format_paragraphs
 from stereoweave.app.pair_form import LABELS
 from stereoweave.app.stereo_pictures import AUTOMATIC_PX, FULL_PX, KINDS, Wish, write_stereo_picture
@@ -96,9 +96,7 @@ class StereoPictureTab:
             _describe,
             self._kind,
             [self._viewing, self._crops],
-            show_progress="hidden",
-            concurrency_limit=None,
-            api_visibility="private",
+            **AT_ONCE,
         )
         return [
             begin(
