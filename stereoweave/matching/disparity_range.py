@@ -108,9 +108,9 @@ def _small_mask(
 def _find_inner(
     seen: Bool[np.ndarray, "h w"] | None, small: Float32[np.ndarray, "h2 w2"]
 ) -> Bool[np.ndarray, "h2 w2"]:
-    """Return the mask of pixels whose entire window has content.
+    """Return the mask of pixels whose entire window has content and lies between the picture's sides.
 
-    Other windows contain the border of the content or of the picture, which is not texture.
+    Other windows contain a border, which is not texture.
     """
     inner = np.ones(small.shape, bool)
     if seen is not None:

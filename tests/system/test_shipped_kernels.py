@@ -27,7 +27,7 @@ shipped_here = pytest.mark.skipif(
 
 
 def kernels():
-    """Return all kernels of the package by name, but those of training, which compiles its own."""
+    """Return all kernels of the package by name, but those of training, which are compiled at first use."""
     found = {}
     for path in sorted(set(PACKAGE.rglob("*_kernels.py")) - set((PACKAGE / "learn").rglob("*"))):
         name = ".".join(["stereoweave", *path.relative_to(PACKAGE).with_suffix("").parts])
