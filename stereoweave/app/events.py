@@ -6,7 +6,6 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import gradio as gr
@@ -26,7 +25,6 @@ VIDEOS: dict[str, Any] = {"concurrency_id": "videos", "concurrency_limit": 1, "a
 STILLS: dict[str, Any] = {"concurrency_id": "stills", "concurrency_limit": 1, "api_visibility": "private"}
 # Settings of the events that are answered at once.
 AT_ONCE: dict[str, Any] = {"show_progress": "hidden", "concurrency_limit": None, "api_visibility": "private"}
-_NOTHING: Mapping[Any, Any] = MappingProxyType({})
 _LOOK_S = 0.2
 _CANCELLED = "Cancelled. Change what you like, and start again. A result below is from before."
 
@@ -76,7 +74,7 @@ class CancelButton:
         status: gr.HTML,
         events: Sequence[Any],
         ends: Sequence[Any],
-        others: Mapping[Any, Any] = _NOTHING,
+        others: Mapping[Any, Any] | None = None,
     ) -> None:
         """Let the button cancel these events; it can be pressed while one of them is running or waiting.
 
@@ -87,7 +85,7 @@ class CancelButton:
             others: Content of other parts of the page after cancelling.
         """
         said = f'<div class="cancelled">{format_notice([_CANCELLED])}</div>'
-        off, cancelled = {self.button: gr.update(interactive=False)}, {status: said, **others}
+        off, cancelled = {self.button: gr.update(interactive=False)}, {status: said, **(others or {})}
 
         def press(request: gr.Request) -> dict[Any, Any]:
             self._pressed.add(str(request.session_hash))
