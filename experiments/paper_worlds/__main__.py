@@ -25,7 +25,7 @@ def paper_worlds(
         int | None, typer.Option(min=1, help="Greatest number of frames to score per split (default: all).")
     ] = None,
 ) -> None:
-    """Score networks in the worlds that they trained on and in others, beside the nearest training frame."""
+    """Score networks on training frames, in the worlds of these and in others, beside the nearest frame."""
     from stereoweave.bench.tables import write_csv
     from stereoweave.learn.recipe import read_recipe
 

@@ -17,22 +17,24 @@ from stereoweave.learn.evaluation import MEDIAN, identify_held_out, load_runs, m
 from stereoweave.learn.recipe import Recipe
 
 NEAREST = "nearest frame"
+TRAINING = "training"
 # The dataset whose frames have poses.
 WORLDS = "paper_worlds"
 
 
 @dataclass(frozen=True, kw_only=True)
 class WorldsRow:
-    """Mean scores of one method on the held-out frames of one split.
+    """Mean scores of one method on frames of one part of a set.
 
     Attributes:
-        split: The recipe's split, whose held-out frames are of the worlds of its training; or the split that
-            it leaves out, whose frames are of other worlds.
+        split: "training", frames that the networks were trained on; the recipe's split, whose held-out frames
+            are of the same worlds; or the split that it leaves out, whose frames are of other worlds.
         method: Name of a run; a baseline of `score_projections`; "median", the training pairs' median
             disparity; or "nearest frame", the true depth of the training frame whose camera is nearest.
         pairs: Number of scored pairs.
         steps: Training steps of a run; 0 for all other methods.
-        nearest_m: Mean distance between the left cameras of a scored pair and of its nearest training frame.
+        nearest_m: Mean distance between the left cameras of a scored pair and of its nearest training frame,
+            which is the pair itself in training.
         epe_cm, epe_px, mae_sourced, sourced_percent, mae_filled, psnr_db, ssim: See `ProjectionRow`.
         epe_cm_sd: Standard deviation of `epe_cm` over the pairs.
     """
@@ -53,7 +55,9 @@ class WorldsRow:
 
 
 def score_worlds(recipe: Recipe, runs: Sequence[Path], most: int | None = None) -> Iterator[WorldsRow]:
-    """Score runs, and methods without training, on the held-out frames and on those of left-out worlds.
+    """Score runs, and methods without training, on training frames, held-out frames and left-out worlds.
+
+    There are as many training frames as held-out ones, evenly spread.
 
     Args:
         recipe: Recipe of a set by world, with a split that it leaves out.
@@ -68,11 +72,12 @@ def score_worlds(recipe: Recipe, runs: Sequence[Path], most: int | None = None) 
     kept = load_runs(runs, (MEDIAN, NEAREST))
     for name, one in kept.items():
         _check_pairs(name, one.recipe, recipe)
-    training, *parts = divide_frames(recipe)
+    training, held_out, left_out = divide_frames(recipe)
     methods = {MEDIAN: make_median_method(DatasetFrames(training))}
     methods |= {name: make_method(one) for name, one in kept.items()}
     scorer = WorldScorer(recipe.max_depth_m, training, read_poses(Path(recipe.root)), methods)
-    for split, frames in zip((recipe.split, recipe.leave_out), parts, strict=True):
+    seen = spread_evenly(training, len(held_out))
+    for split, frames in ((TRAINING, seen), (recipe.split, held_out), (recipe.leave_out, left_out)):
         for row in scorer.score(spread_evenly(frames, most)):
             found = kept.get(row["method"])
             yield WorldsRow(split=split, steps=found.step if found else 0, **row)

@@ -64,12 +64,19 @@ def rows(recipe, run):
     return {(row.split, row.method): row for row in score_worlds(recipe, [run])}
 
 
-def test_every_method_is_scored_on_both_splits(rows):
+def test_every_method_is_scored_on_training_frames_and_on_both_splits(rows):
     methods = ["ground truth", "no warping", "sgbm", "nearest frame", "median", "tiny"]
-    assert list(rows) == [(split, method) for split in ("random", "disjoint") for method in methods]
+    splits = ("training", "random", "disjoint")
+    assert list(rows) == [(split, method) for split in splits for method in methods]
+    assert {rows["training", method].pairs for method in methods} == {1}
     assert {rows["random", method].pairs for method in methods} == {1}
     assert {rows["disjoint", method].pairs for method in methods} == {10}
     assert [rows["random", method].steps for method in ("median", "tiny")] == [0, 20]
+
+
+def test_a_training_frame_is_its_own_nearest_frame(rows):
+    row = rows["training", "nearest frame"]
+    assert (row.epe_cm, row.nearest_m) == (0, 0)
 
 
 def test_in_a_seen_world_the_nearest_frame_is_a_neighbour(rows):
@@ -94,7 +101,7 @@ def test_the_truth_has_no_error_and_no_warping_is_at_15_m(rows):
 
 
 def test_fewer_frames_are_scored_on_request_and_runs_are_optional(recipe):
-    assert [row.pairs for row in score_worlds(recipe, [], 3)] == 5 * [1] + 5 * [3]
+    assert [row.pairs for row in score_worlds(recipe, [], 3)] == 5 * [1] + 5 * [1] + 5 * [3]
 
 
 @pytest.mark.parametrize(
