@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Shaped, UInt8
+from jaxtyping import Bool, Float, Float32, Int, Shaped, UInt8
 
 from stereoweave.stereo import Estimate
 
@@ -203,10 +203,17 @@ def _measure_deviation(
     """Return the deviation of each level difference from the median difference in its bin of left levels."""
     differences = right.astype(int) - left
     bins = left // _BIN_LEVELS
-    medians = [
-        np.median(differences[bins == one]) if (bins == one).any() else 0 for one in range(bins.max() + 1)
-    ]
-    return np.abs(differences - np.asarray(medians)[bins])
+    counts = np.bincount(511 * bins.astype(int) + differences + 255, minlength=511 * (int(bins.max()) + 1))
+    return np.abs(differences - _find_medians(counts.reshape(-1, 511))[bins])
+
+
+def _find_medians(counts: Int[np.ndarray, "bins 511"]) -> Float[np.ndarray, " bins"]:
+    """Return each bin's median of the differences -255..255, given their counts; arbitrary if it is empty."""
+    below = counts.cumsum(axis=1)
+    total = below[:, -1:]
+    # Of an even number, the mean of the two in the middle.
+    middle = [(below >= rank).argmax(axis=1) for rank in ((total + 1) // 2, total // 2 + 1)]
+    return (middle[0] + middle[1]) / 2 - 255
 
 
 def _fit_curve(left: UInt8[np.ndarray, " n"], right: UInt8[np.ndarray, " n"]) -> Float[np.ndarray, " 511"]:
