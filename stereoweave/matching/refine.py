@@ -1,13 +1,14 @@
 """Refinement of an estimate by matching once more at full resolution, with the network's disparity as prior.
 
 The method is semi-global matching (Hirschmueller 2008) over all disparities between the network's least and
-greatest disparity. A candidate's cost is the colour and census difference, plus the confidence-weighted
-distance to the network's disparity. Disparities on which both views agree replace the network's disparities.
-This recovers edges, as well as thin structures that are below the network's resolution.
+greatest disparity, at and around pixels of which the network is not certain. A candidate's cost is the colour
+and census difference, plus the confidence-weighted distance to the network's disparity. Disparities on which
+both views agree replace the network's disparities. This recovers edges, as well as thin structures that are
+below the network's resolution.
 """
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, NamedTuple
 
 import cv2
 import numpy as np
@@ -33,10 +34,33 @@ _OVERLAP_PX = 24
 # Penalty for a large disparity step: greatest between equal grey levels, halved at this grey difference.
 _LARGEST_STEP, _LEAST_LARGE_STEP = 125, 30
 _HALVING_LEVELS = 30
+# Disparities are searched up to this far from those that are not certain: 36 % of the pixels of real pairs.
+# New views gain 0.1 dB from a search everywhere, and lose 0.3 dB without the pixels around.
+_REACH_PX = 4
+_AROUND = np.ones((2 * _REACH_PX + 1, 2 * _REACH_PX + 1), np.uint8)
 # Factor on a pixel's confidence where the network's disparities for the two views disagree.
 _DOUBTED = 0.2
 _SAME_PX = 1.0
 _MOST_THREADS = 4
+
+
+class _View(NamedTuple):
+    """A view to match.
+
+    Attributes:
+        own: Cues of the view.
+        other: Cues of the other image, aligned for the kernels.
+        towards: -1 for the left view, whose matches are to the left, and 1 for the right view.
+    """
+
+    own: "Cues"
+    other: "Cues"
+    towards: int
+
+    def take(self, rows: slice) -> "_View":
+        """Return a strip of rows of the view."""
+        own, other = (type(cues)(*(cue[rows] for cue in cues)) for cues in self[:2])
+        return _View(own, other, self.towards)
 
 
 @step("refining")
@@ -48,7 +72,7 @@ def refine(
 ) -> Estimate:
     """Correct the disparities of both views by semi-global matching at full resolution.
 
-    The network's disparity is kept where matching confirms it to within 1.5 px (the network is then more
+    The network's disparity is kept where matching confirms it to within 1 px (the network is then more
     precise), where its confidence is high, and where the two views disagree. The confidence does not change.
     Different exposures are equalised first.
 
@@ -63,8 +87,9 @@ def refine(
     looks = match_exposure(left, right, estimate)
     if looks is not None:
         pair = StereoPair(left=left, right=recolour(right, looks.tables(0)[1]))
-    found_px, right_found_px = _match_views(pair, estimate, min(_MOST_THREADS, thread_count(threads)))
     trust, right_trust = np.asarray(estimate.confidence, np.float32, order="C"), right_confidence(estimate)
+    count = min(_MOST_THREADS, thread_count(threads))
+    found_px, right_found_px = _match_views(pair, estimate, right_trust, count)
     disparity_px = _settle(estimate.disparity_px, found_px, right_found_px, trust, -1)
     right_disparity_px = _settle(estimate.right_disparity_px, right_found_px, found_px, right_trust, 1)
     return Estimate(
@@ -85,7 +110,7 @@ def find_matching_costs(pair: StereoPair, count: int) -> UInt8[np.ndarray, "h w 
     nothing = np.zeros(pair.left.shape[:2], np.float32)
     own, other = (_cues(image, nothing, nothing) for image in (pair.left, pair.right))
     costs = np.empty((*nothing.shape, count), np.uint8)
-    kernels.match(own, _reverse_columns(other, 0, count), 0, len(costs), costs)
+    kernels.match(own, _align(other, 0, count, -1), -1, 0, len(costs), costs)
     return costs
 
 
@@ -113,64 +138,59 @@ def _settle(
 
 
 def _match_views(
-    pair: StereoPair, estimate: Estimate, threads: int
+    pair: StereoPair, estimate: Estimate, right_trust: Float32[np.ndarray, "h w"], threads: int
 ) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
     """Match both views, and return the disparities of least cost in each view."""
     first_px, count = _candidates(estimate)
     left = _cues(pair.left, estimate.disparity_px - first_px, estimate.confidence)
-    right = _cues(pair.right, estimate.right_disparity_px - first_px, right_confidence(estimate))
-    mirrored = _index_cues(right, np.s_[..., ::-1]), _index_cues(left, np.s_[..., ::-1])
-    views = [(own, _reverse_columns(other, first_px, count)) for own, other in ((left, right), mirrored)]
+    right = _cues(pair.right, estimate.right_disparity_px - first_px, right_trust)
+    views = [
+        _View(left, _align(right, first_px, count, -1), -1),
+        _View(right, _align(left, first_px, count, 1), 1),
+    ]
     height, width = left.grey.shape
     found_px = np.empty((2, height, width), np.float32)
     step = max(_CANDIDATES_AT_ONCE // (width * count), 4 * _OVERLAP_PX) - 2 * _OVERLAP_PX
     for top in range(0, height, step):
         rows = slice(max(top - _OVERLAP_PX, 0), min(top + step + _OVERLAP_PX, height))
-        strip = [(_index_cues(own, rows), _index_cues(other, rows)) for own, other in views]
+        strip = [view.take(rows) for view in views]
         strip_px = _match_strip(strip, first_px, count, threads)
         found_px[:, top : top + step] = strip_px[:, top - rows.start :][:, :step]
-    return found_px[0], np.ascontiguousarray(found_px[1, :, ::-1])
+    return found_px[0], found_px[1]
 
 
-def _match_strip(
-    views: list[tuple["Cues", "Cues"]], first_px: int, count: int, threads: int
-) -> Float32[np.ndarray, "2 h w"]:
-    """Match a strip of rows of both views, each given as the left view of a pair."""
-    size = (*views[0][0].grey.shape, count)
+def _match_strip(views: list[_View], first_px: int, count: int, threads: int) -> Float32[np.ndarray, "2 h w"]:
+    """Match a strip of rows of both views."""
+    size = (*views[0].own.grey.shape, count)
     # Both views share the buffers, because allocating new memory takes as long as aggregating one path.
     costs, sums = np.empty(size, np.uint8), np.empty(size, np.uint16)
-    return np.stack([_match_view(own, other, (costs, sums), first_px, threads) for own, other in views])
+    return np.stack([_match_view(view, (costs, sums), first_px, threads) for view in views])
 
 
 def _match_view(
-    own: "Cues",
-    other: "Cues",
+    view: _View,
     volumes: tuple[UInt8[np.ndarray, "h w d"], UInt16[np.ndarray, "h w d"]],
     first_px: int,
     threads: int,
 ) -> Float32[np.ndarray, "h w"]:
-    """Match a left view; `volumes` are buffers for the matching costs and their sums over all paths."""
+    """Match a view; `volumes` are buffers for the matching costs and their sums over all paths."""
     from stereoweave.matching import refine_kernels as kernels
 
+    own, other, towards = view
     height, width = own.grey.shape
     costs, sums = volumes
     steps_along, steps_down = (_large_steps(own.grey, axis) for axis in (1, 0))
-    found_px = np.empty((height, width), np.float32)
+    found_px = first_px + own.prior / np.float32(kernels.SUBSTEPS)
 
     def match(first: int, last: int) -> None:
-        kernels.match(own, other, first, last, costs)
-        kernels.along_rows(costs, steps_along, first, last, sums)
+        kernels.match(own, other, towards, first, last, costs)
+        kernels.along_rows(costs, own, steps_along, first, last, sums)
+
+    def pick(first: int, last: int) -> None:
+        kernels.along_columns(costs, own, steps_down, first_px, first, last, sums, found_px)
 
     in_bands(match, height, threads, threads)
-    in_bands(
-        lambda first, last: kernels.along_columns(costs, steps_down, first, last, sums),
-        width,
-        threads,
-        threads,
-    )
-    in_bands(
-        lambda first, last: kernels.pick(sums, first_px, first, last, found_px), height, threads, threads
-    )
+    in_bands(pick, width, threads, threads)
     return found_px
 
 
@@ -202,19 +222,32 @@ def _cues(image: UInt8[np.ndarray, "h w 3"], above_first_px: np.ndarray, trust: 
         brightest=np.maximum(colour, np.maximum(halfway[..., :-1], halfway[..., 1:])),
         prior=np.rint(above_first_px * kernels.SUBSTEPS).astype(np.uint16),
         trust=np.rint(trust * kernels.MOST_TRUST).astype(np.uint16),
+        searched=cv2.dilate((trust < kernels.CERTAIN).astype(np.uint8), _AROUND) > 0,
     )
 
 
-def _reverse_columns(cues: "Cues", first_px: int, count: int) -> "Cues":
-    """Reverse the other image's columns for the kernels, and pad them with copies of the border columns."""
+def _align(cues: "Cues", first_px: int, count: int, towards: int) -> "Cues":
+    """Place the other image's columns as the kernels read them, between copies of the border columns.
+
+    Only what the kernels read of the other image is placed: `grey` and `searched` stay as they are.
+    """
     width = cues.grey.shape[1]
-    columns = np.clip(width - 1 - first_px - np.arange(width + count - 1), 0, width - 1)
-    return type(cues)(*(cue.take(columns, -1) for cue in cues))
+    columns = first_px + np.arange(width + count - 1)
+    inside = slice(*np.searchsorted(columns, [0, width]))
+    placed = {
+        name: _place(cue[..., ::towards], columns, inside)
+        for name, cue in cues._asdict().items()
+        if name not in ("grey", "searched")
+    }
+    return cues._replace(**placed)
 
 
-def _index_cues(cues: "Cues", index: Any) -> "Cues":
-    """Apply the same index to every array of the cues."""
-    return type(cues)(*(np.ascontiguousarray(cue[index]) for cue in cues))
+def _place(cue: np.ndarray, columns: np.ndarray, inside: slice) -> np.ndarray:
+    """Take these columns, of which those `inside` exist; the others are copies of the border columns."""
+    placed = np.empty((*cue.shape[:-1], len(columns)), cue.dtype)
+    placed[..., : inside.start], placed[..., inside.stop :] = cue[..., :1], cue[..., -1:]
+    placed[..., inside] = cue[..., columns[0] + inside.start : columns[0] + inside.stop]
+    return placed
 
 
 def right_confidence(estimate: Estimate) -> Float32[np.ndarray, "h w"]:
@@ -225,8 +258,8 @@ def right_confidence(estimate: Estimate) -> Float32[np.ndarray, "h w"]:
     return np.where(agreed, confidence, np.float32(_DOUBTED) * confidence)
 
 
-def _large_steps(grey: UInt8[np.ndarray, "h w"], axis: int) -> UInt16[np.ndarray, "h w"]:
+def _large_steps(grey: UInt8[np.ndarray, "h w"], axis: int) -> UInt8[np.ndarray, "h w"]:
     """Return the penalty for a large step from the previous pixel to each pixel, lower at grey edges."""
     before = grey.take([0, *range(grey.shape[axis] - 1)], axis)
-    costs = _LARGEST_STEP / (1 + cv2.absdiff(grey, before).astype(np.float32) / _HALVING_LEVELS)
-    return np.maximum(costs, _LEAST_LARGE_STEP).astype(np.uint16)
+    by_difference = _LARGEST_STEP / (1 + np.arange(256, dtype=np.float32) / _HALVING_LEVELS)
+    return cv2.LUT(cv2.absdiff(grey, before), np.maximum(by_difference, _LEAST_LARGE_STEP).astype(np.uint8))

@@ -1,9 +1,8 @@
-"""Numba kernels of `refine`, in the order in which they are called.
+"""Numba kernels of `refine`, in the order in which they are called; `pick` is for bench/classical alone.
 
-The plain reference implementation is tests/helpers/plain_refining.py. All kernels process a left view; the
-right view is processed as the left view of the mirrored pair. Volumes are [H, W, D]. Candidate i is the
-disparity first_px + i. The columns of the other image's `Cues` are reversed, so the candidates of column x,
-at W - 1 - x + i, are contiguous in memory.
+The plain reference implementation is tests/helpers/plain_refining.py. Volumes are [H, W, D]. Candidate i is
+the disparity first_px + i. For a left view, the columns of the other image's `Cues` are reversed, so that the
+candidates of column x, at W - 1 - x + i, are contiguous in memory; for a right view they are at x + i.
 """
 
 import typing
@@ -22,7 +21,7 @@ MOST_DIFFERENCE = np.uint8(40)
 """Upper limit of a channel's difference, because any greater difference means a different surface."""
 SMALL_STEP = 20
 """Penalty for a disparity step of one candidate between two pixels of a path."""
-PRECISE_PX = 1.5
+PRECISE_PX = 1.0
 """Within this distance of the matched disparity, the network's disparity is more precise."""
 CERTAIN = 0.85
 """Above this confidence, replacing the network's disparities does more harm than good."""
@@ -51,6 +50,7 @@ class Cues(typing.NamedTuple):
         brightest: uint8 [H, 3, W], greatest level within half a pixel to either side.
         prior: uint16, the network's disparity minus first_px in 1/SUBSTEPS px, up to 8191 px.
         trust: uint16, weight of the prior, 0..MOST_TRUST.
+        searched: bool, pixels whose disparity is searched; elsewhere the network's is certain.
     """
 
     grey: np.ndarray
@@ -60,6 +60,7 @@ class Cues(typing.NamedTuple):
     brightest: np.ndarray
     prior: np.ndarray
     trust: np.ndarray
+    searched: np.ndarray
 
 
 @kernel
@@ -67,16 +68,21 @@ class Cues(typing.NamedTuple):
 def census(grey, codes):
     """Write each pixel's 5x5 census code into codes: one bit per neighbour, set if it is darker."""
     height, width = grey.shape
+    # A row with copies of its ends, so that the innermost loop can be vectorised.
+    row = np.empty(width + 2 * _CENSUS_RADIUS, np.uint8)
     for y in range(height):
-        for x in range(width):
-            code = np.uint32(0)
-            for dy in range(-_CENSUS_RADIUS, _CENSUS_RADIUS + 1):
-                row = min(max(y + dy, 0), height - 1)
-                for dx in range(-_CENSUS_RADIUS, _CENSUS_RADIUS + 1):
-                    if dy != 0 or dx != 0:
-                        column = min(max(x + dx, 0), width - 1)
-                        code = np.uint32((code << _ONE) | np.uint32(grey[row, column] < grey[y, x]))
-            codes[y, x] = code
+        codes[y] = 0
+        for dy in range(-_CENSUS_RADIUS, _CENSUS_RADIUS + 1):
+            around = grey[min(max(y + dy, 0), height - 1)]
+            for x in range(_CENSUS_RADIUS):
+                row[x], row[width + _CENSUS_RADIUS + x] = around[0], around[width - 1]
+            for x in range(width):
+                row[_CENSUS_RADIUS + x] = around[x]
+            for i in range(2 * _CENSUS_RADIUS + 1):
+                if dy != 0 or i != _CENSUS_RADIUS:
+                    for x in range(width):
+                        darker = np.uint32(row[x + i] < grey[y, x])
+                        codes[y, x] = np.uint32((codes[y, x] << _ONE) | darker)
 
 
 @inlined
@@ -160,12 +166,17 @@ def _add_pulls(prior, trust, priors, trusts, costs):
 
 @kernel
 @typing.no_type_check
-def match(own, other, first, last, costs):
-    """Write the matching cost of each candidate into rows first..last of costs (uint8)."""
+def match(own, other, towards, first, last, costs):
+    """Write the matching cost of each candidate at searched pixels into rows first..last of costs (uint8).
+
+    towards is -1 for a left view, whose matches are to the left, and 1 for a right view.
+    """
     _, width, count = costs.shape
     for y in range(first, last):
         for x in range(width):
-            start = width - 1 - x
+            if not own.searched[y, x]:
+                continue
+            start = x if towards > 0 else width - 1 - x
             end = start + count
             out = costs[y, x]
             _differences(
@@ -180,6 +191,16 @@ def match(own, other, first, last, costs):
             _add_census(own.census[y, x], other.census[y, start:end], out)
             priors, trusts = other.prior[y, start:end], other.trust[y, start:end]
             _add_pulls(own.prior[y, x], own.trust[y, x], priors, trusts, out)
+
+
+@inlined
+@typing.no_type_check
+def _start(prior, path):
+    """Write a path's costs at a pixel of certain disparity: 0 within 1 px (DOUBTLESS) of it, else _NEVER."""
+    for i in range(path.shape[0] - 2):
+        candidate = np.uint16(SUBSTEPS * i)
+        away = np.uint16(max(prior, candidate) - min(prior, candidate))
+        path[i + 1] = np.uint16(0) if away <= DOUBTLESS else _NEVER
 
 
 @inlined
@@ -199,29 +220,71 @@ def _step(before, least, costs, large_step, after, sums):
 
 @kernel
 @typing.no_type_check
-def along_rows(costs, large_step, first, last, sums):
+def along_rows(costs, own, large_step, first, last, sums):
     """Write the summed costs of the paths from the left and the right into rows first..last of sums.
 
-    large_step [H, W] is the penalty for a large step from the previous pixel to each pixel.
+    Sums are of searched pixels alone. large_step [H, W] is the penalty for a large step from the previous
+    pixel to each pixel.
     """
     _, width, count = costs.shape
     paths = np.empty((2, count + 2), np.uint16)
     for y in range(first, last):
-        sums[y] = 0
         for backwards in range(2):
             paths[:] = 0
             paths[:, 0] = paths[:, count + 1] = _NEVER
-            least = np.uint16(0)
+            least, known = np.uint16(0), False
             for i in range(width):
                 x = width - 1 - i if backwards else i
-                jump = large_step[y, min(x + backwards, width - 1)]
-                least = _step(paths[i & 1], least, costs[y, x], jump, paths[1 - (i & 1)], sums[y, x])
+                if own.searched[y, x]:
+                    before, after = paths[i & 1], paths[1 - (i & 1)]
+                    if known:
+                        _start(own.prior[y, x - 1 + 2 * backwards], before)
+                        least = np.uint16(0)
+                    if not backwards:
+                        sums[y, x] = 0
+                    jump = large_step[y, min(x + backwards, width - 1)]
+                    least = _step(before, least, costs[y, x], jump, after, sums[y, x])
+                known = not own.searched[y, x]
+
+
+@inlined
+@typing.no_type_check
+def _between(before, here, after):
+    """Return the offset, -0.5..0.5 px, at which two lines of opposite slope through three costs meet."""
+    rise = max(np.int32(before), np.int32(after)) - np.int32(here)
+    return 0.5 * (np.int32(before) - np.int32(after)) / rise if rise > 0 else 0.0
+
+
+@inlined
+@typing.no_type_check
+def _find_least(costs):
+    """Return the candidate of least cost, with a subpixel offset."""
+    count = costs.shape[0]
+    lowest = costs[0]
+    for i in range(count):
+        lowest = min(lowest, costs[i])
+    i = 0
+    while costs[i] != lowest:
+        i += 1
+    return i + (_between(costs[i - 1], lowest, costs[i + 1]) if 0 < i < count - 1 else 0.0)
 
 
 @kernel
 @typing.no_type_check
-def along_columns(costs, large_step, first, last, sums):
-    """Add the costs of the paths from above and below to columns first..last of sums."""
+def pick(sums, first_px, first, last, found_px):
+    """Write the disparities of least cost, with subpixel offsets, into rows first..last of found_px."""
+    for y in range(first, last):
+        for x in range(sums.shape[1]):
+            found_px[y, x] = first_px + _find_least(sums[y, x])
+
+
+@kernel
+@typing.no_type_check
+def along_columns(costs, own, large_step, first_px, first, last, sums, found_px):
+    """Add the paths from above and below to columns first..last of sums, at searched pixels.
+
+    The disparities of least cost are written to the same columns of found_px.
+    """
     height, _, count = costs.shape
     width = last - first
     paths = np.empty((2, width, count + 2), np.uint16)
@@ -234,36 +297,16 @@ def along_columns(costs, large_step, first, last, sums):
             y = height - 1 - i if backwards else i
             jumps = large_step[min(y + backwards, height - 1)]
             before, after = paths[i & 1], paths[1 - (i & 1)]
+            y_before = y - 1 + 2 * backwards
             for j in range(width):
                 x = first + j
-                least[j] = _step(before[j], least[j], costs[y, x], jumps[x], after[j], sums[y, x])
-
-
-@inlined
-@typing.no_type_check
-def _between(before, here, after):
-    """Return the offset, -0.5..0.5 px, at which two lines of opposite slope through three costs meet."""
-    rise = max(np.int32(before), np.int32(after)) - np.int32(here)
-    return 0.5 * (np.int32(before) - np.int32(after)) / rise if rise > 0 else 0.0
-
-
-@kernel
-@typing.no_type_check
-def pick(sums, first_px, first, last, found_px):
-    """Write the disparities of least cost, with subpixel offsets, into rows first..last of found_px."""
-    _, width, count = sums.shape
-    for y in range(first, last):
-        for x in range(width):
-            costs = sums[y, x]
-            lowest = costs[0]
-            for i in range(count):
-                lowest = min(lowest, costs[i])
-            i = 0
-            while costs[i] != lowest:
-                i += 1
-            found_px[y, x] = first_px + i
-            if 0 < i < count - 1:
-                found_px[y, x] += _between(costs[i - 1], lowest, costs[i + 1])
+                if own.searched[y, x]:
+                    if i > 0 and not own.searched[y_before, x]:
+                        _start(own.prior[y_before, x], before[j])
+                        least[j] = 0
+                    least[j] = _step(before[j], least[j], costs[y, x], jumps[x], after[j], sums[y, x])
+                    if backwards:
+                        found_px[y, x] = first_px + _find_least(sums[y, x])
 
 
 @kernel

@@ -34,23 +34,31 @@ def plain_census(grey):
     return codes
 
 
-def plain_sums(costs, grey):
-    """Return each candidate's aggregated cost, the sum over paths from left, right, above and below."""
+def plain_sums(costs, own):
+    """Return each candidate's aggregated cost, the sum over paths from left, right, above and below.
+
+    A path that comes from a pixel that is not searched begins there, at the prior, without a cost. `own` are
+    `Cues`.
+    """
     total = np.zeros(costs.shape, int)
+    away = abs(own.prior[..., None].astype(int) - 8 * np.arange(costs.shape[2]))
+    known = np.where(away <= 8, 0, OUTSIDE)
     for axis in (0, 1):
         for backwards in (False, True):
-            lines = [np.swapaxes(values, 0, axis) for values in (costs, grey.astype(int), total)]
+            volumes = (costs, own.grey.astype(int), own.searched, known, total)
+            lines = [np.swapaxes(values, 0, axis) for values in volumes]
             if backwards:
                 lines = [line[::-1] for line in lines]
             _add_path(*lines)
     return total
 
 
-def _add_path(costs, grey, total):
+def _add_path(costs, grey, searched, known, total):
     """Add the path down the first axis, all columns at once."""
     path = costs[0].copy()
     total[0] += path
     for y in range(1, len(costs)):
+        path = np.where(searched[y - 1, :, None], path, known[y - 1])
         jump = np.maximum((125 / (1 + abs(grey[y] - grey[y - 1]).astype(np.float32) / 30)).astype(int), 30)
         least = path.min(1, keepdims=True)
         beside = np.pad(path, ((0, 0), (1, 1)), constant_values=OUTSIDE)
@@ -83,7 +91,7 @@ def plain_settled(disparity_px, found_px, other_px, trust, towards):
     match = np.rint(np.arange(width) + towards * found_px).astype(int)
     there_px = np.take_along_axis(other_px, np.clip(match, 0, width - 1), axis=1)
     agreed = (match >= 0) & (match < width) & (abs(there_px - found_px) <= 1)
-    change = agreed & (abs(disparity_px - found_px) > 1.5) & (trust < 0.85)
+    change = agreed & (abs(disparity_px - found_px) > 1) & (trust < 0.85)
     settled_px = np.where(change, found_px, disparity_px)
     for y in range(len(settled_px)):
         row_px, known, sure = (values[y, ::-towards] for values in (settled_px, agreed, trust >= 0.85))

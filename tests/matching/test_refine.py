@@ -11,7 +11,10 @@ from stereoweave.stereo import Estimate, StereoPair
 
 FAR_PX, NEAR_PX, STICK_PX = 6, 16, 12
 STICK = slice(60, 65)
+MAPS = ("disparity_px", "right_disparity_px", "confidence", "occluded")
 BLOCK = (slice(20, 50), slice(90, 120))
+# Of 24x50 pixels. No other pixel of it is certain, so that paths begin at its four sides.
+CERTAIN = (slice(4, 20), slice(10, 40))
 
 
 @pytest.fixture
@@ -126,11 +129,12 @@ def test_parallel_cameras_get_no_negative_disparities(rng):
 
 
 def random_pair(rng):
-    """Return random images and a random estimate, which exercise every branch."""
+    """Return random images and a random estimate, which exercise every branch; a block in it is certain."""
     left, right = (cv2.blur(rng.integers(0, 256, (24, 50, 3), np.uint8), (3, 3)) for _ in range(2))
     maps = [np.repeat(rng.uniform(-3, 9, (24, 10)), 5, 1) for _ in range(2)]
-    given = estimate_of(*maps)
-    return left, right, Estimate(**vars(given) | {"confidence": rng.random((24, 50), np.float32)})
+    given, confidence = estimate_of(*maps), rng.random((24, 50), np.float32)
+    confidence[CERTAIN] = 0.9
+    return left, right, Estimate(**vars(given) | {"confidence": confidence})
 
 
 def test_the_kernels_equal_the_plain_ones(rng):
@@ -141,16 +145,25 @@ def test_the_kernels_equal_the_plain_ones(rng):
     for view in (own, other):
         np.testing.assert_array_equal(view.census, plain_census(view.grey))
     costs = np.empty((24, 50, count), np.uint8)
-    kernels.match(own, refining._reverse_columns(other, first_px, count), 0, 24, costs)
-    np.testing.assert_array_equal(costs, plain_costs(own, other, first_px, count))
-    found_px = refining._match_views(StereoPair(left=left, right=right), given, 1)
-    expected_px = plain_pick(plain_sums(costs.astype(int), own.grey), first_px)
-    np.testing.assert_allclose(found_px[0], expected_px, atol=1e-5)
+    kernels.match(own, refining._align(other, first_px, count, -1), -1, 0, 24, costs)
+    expected = plain_costs(own, other, first_px, count)
+    np.testing.assert_array_equal(costs[own.searched], expected[own.searched])
+    found_px, _ = refining._match_views(
+        StereoPair(left=left, right=right), given, refining.right_confidence(given), 1
+    )
+    expected_px = plain_pick(plain_sums(expected, own), first_px)
+    np.testing.assert_allclose(found_px[own.searched], expected_px[own.searched], atol=1e-5)
+    np.testing.assert_allclose(found_px[~own.searched], given.disparity_px[~own.searched], atol=1 / 16)
+    searched = np.ones((24, 50), bool)
+    searched[8:16, 14:36] = False  # 4 px and more inside the block
+    np.testing.assert_array_equal(own.searched, searched)
 
 
 def test_both_views_settle_as_the_plain_ones(rng):
     left, right, given = random_pair(rng)
-    found_px = refining._match_views(StereoPair(left=left, right=right), given, 1)
+    found_px = refining._match_views(
+        StereoPair(left=left, right=right), given, refining.right_confidence(given), 1
+    )
     refined = refine(left, right, given)
     expected = plain_settled(given.disparity_px, *found_px, given.confidence, -1)
     np.testing.assert_array_equal(refined.disparity_px, expected)
@@ -162,8 +175,14 @@ def test_both_views_settle_as_the_plain_ones(rng):
 def test_a_right_view_is_matched_as_the_left_one_of_the_mirrored_pair(scene):
     left, right, _, right_px = scene
     pair, given = StereoPair(left=left, right=right), estimate_of(right_px, right_px, confidence=0)
-    found_px, right_found_px = refining._match_views(pair, given, 1)
-    mirrored_px, right_mirrored_px = refining._match_views(pair.mirror(), given, 1)
+    trust = np.zeros(right_px.shape, np.float32)
+    trust[10:30, 30:100] = 0.9
+    given = Estimate(**vars(given) | {"confidence": trust})
+    found_px, right_found_px = refining._match_views(pair, given, trust, 1)
+    turned = {name: values[:, ::-1].copy() for name, values in vars(given).items() if name in MAPS}
+    mirrored_px, right_mirrored_px = refining._match_views(
+        pair.mirror(), Estimate(**vars(given) | turned), trust[:, ::-1].copy(), 1
+    )
     np.testing.assert_array_equal(mirrored_px[:, ::-1], right_found_px)
     np.testing.assert_array_equal(right_mirrored_px[:, ::-1], found_px)
     assert (abs(right_found_px - right_px) < 1).mean() > 0.9
