@@ -30,7 +30,7 @@ from stereoweave.io.output_lock import lock_output
 from stereoweave.io.run_folder import check_claim, check_unclaimed, describe_run, parse_description
 from stereoweave.matching.backend import Backend
 from stereoweave.matching.estimate import match
-from stereoweave.matching.matcher import Matcher, model_file
+from stereoweave.matching.matcher import MODES, Matcher, model_file
 from stereoweave.matching.options import MatchOptions
 from stereoweave.system.progress import progress
 
@@ -115,7 +115,7 @@ def _describe(submission: Submission, backend: Backend, refined: bool) -> dict[s
     return {
         "stereoweave": __version__,
         "model": f"{Path(backend.model).name} {digest[:12]}",
-        "refined": refined,
+        "refined": refined or str(backend.model) in MODES,
         "provider": backend.provider,
         "threads": backend.threads,
         "dataset": submission.dataset,

@@ -323,7 +323,7 @@ def training(
 def _list_makers(
     models: Sequence[str] | None, threads: int | None, provider: str
 ) -> dict[str, Callable[[], Any]]:
-    """Return factories of the named networks, plain and refined. Default: all shipped networks."""
+    """Return factories of the named networks, also refined if they are not always. Default: all shipped."""
     from stereoweave.bench.pairs import make_matcher
     from stereoweave.matching.matcher import MODES, shipped_models
 
@@ -332,7 +332,7 @@ def _list_makers(
         # Absolute, because cluster workers have another current folder.
         model = str(Path(name).absolute()) if Path(name).is_file() else name
         makers[name] = partial(make_matcher, model, threads, provider=provider)
-        if name not in MODES:  # modes choose refinement themselves
+        if name not in MODES:  # they always refine
             makers[name + REFINED] = partial(make_matcher, model, threads, refined=True, provider=provider)
     return makers
 

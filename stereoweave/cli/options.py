@@ -109,7 +109,7 @@ Refined = Annotated[
     typer.Option(
         "--refined",
         help="Match once more at full resolution (up to 2 megapixels), for thin structures and sharper "
-        "edges.",
+        "edges; base and best always do.",
     ),
 ]
 Raw = Annotated[
@@ -138,8 +138,8 @@ Screen = Annotated[
 Model = Annotated[
     str,
     typer.Option(
-        help="Shipped network (small or base), or an .onnx matcher file. For stills, also best, which runs "
-        "base a second time at 1.5 times the size and refines the result."
+        help="Shipped network (small or base), or an .onnx matcher file. base is always refined. For "
+        "stills, also best, which runs it a second time at 1.5 times the size and settles edges by vote."
     ),
 ]
 Threads = Annotated[int | None, typer.Option(min=1, help="Number of CPU threads (default: all cores).")]

@@ -15,7 +15,7 @@ class Backend:
     """A network and its settings; each process loads the network once.
 
     Attributes:
-        model: Name of a shipped network, the preset `best`, or the path of an .onnx matcher file.
+        model: Name of a shipped network, `best`, or the path of an .onnx matcher file.
         threads: Maximum number of threads per call; default: all cores.
         provider: Execution provider, a name in `providers.PROVIDERS`.
     """

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, UInt8
 from stereoweave.arguments import check_kind
 from stereoweave.errors import MatcherError, StereoweaveError
 from stereoweave.io.images import SMALLEST_SIDE_PX
-from stereoweave.matching.edge_vote.vote import vote_at_edges
+from stereoweave.matching.edge_vote.vote import sharpen_edges, vote_at_edges
 from stereoweave.matching.left_right_check import OCCLUSION_STEP_PX, is_occluded, measure_disagreement
 from stereoweave.matching.occlusion_fill import fill_occluded
 from stereoweave.matching.options import MatchOptions
@@ -47,21 +47,21 @@ _PLAIN_GREY_LEVELS = 2
 
 
 class Mode(NamedTuple):
-    """A named preset, which can be used in place of a network's name.
+    """A way to run a network, which a name selects.
 
     Attributes:
         network: Name of the shipped network.
         magnification: Greatest factor by which pairs are magnified for the network.
-        refined: Whether every estimate is refined.
+        voted: Whether edges, speckles and unsure disparities are corrected by vote.
     """
 
     network: str
-    magnification: float
-    refined: bool
+    magnification: float = 1.0
+    voted: bool = False
 
 
-MODES = {"best": Mode(network="base", magnification=1.5, refined=True)}
-"""Presets by name. `best` is for stills: it improves thin structures and edges but is much slower."""
+MODES = {"base": Mode(network="base"), "best": Mode(network="base", magnification=1.5, voted=True)}
+"""Modes by name; both refine every estimate. `best` is for stills: it improves edges but is much slower."""
 
 
 class Maps(NamedTuple):
@@ -76,8 +76,8 @@ class Matcher:
     """A loaded matcher file.
 
     Args:
-        model: Name of a shipped network (`shipped_models`) or of a preset in `MODES`, or the path of an .onnx
-            file.
+        model: Name of a shipped network (`shipped_models`) or of a mode in `MODES`, or the path of an .onnx
+            file, whose estimates are refined on request only.
         threads: Maximum number of threads per call; default: all cores available to the process.
         provider: Execution provider, a name in `providers.PROVIDERS`.
 
@@ -86,6 +86,8 @@ class Matcher:
         fixed_size: Height and width of a network with a fixed input size; None if it accepts any size.
         magnification: Greatest factor by which `match` magnifies pairs for the network; `estimate` ignores
             it.
+        refines: Whether every estimate is refined.
+        votes: Whether edges, speckles and unsure disparities are corrected by vote.
 
     Raises:
         MatcherError: The model is unknown, the matcher file is invalid or the provider is unavailable.
@@ -98,7 +100,8 @@ class Matcher:
         self.threads, self.provider = threads, provider
         mode = MODES.get(str(model))
         self.magnification = mode.magnification if mode else 1.0
-        self.refines = mode is not None and mode.refined
+        self.refines = mode is not None
+        self.votes = mode is not None and mode.voted
         self._session = open_session(self._path, provider, thread_count(threads))
         try:
             self._outputs = self._read_outputs()
@@ -134,7 +137,7 @@ class Matcher:
             left: Left image, uint8 RGB [H, W, 3].
             right: Right image of the same size.
             refined: Match once more at full resolution (`refine.refine`), which is slower but recovers thin
-                structures and sharper edges.
+                structures and sharper edges. The modes always do.
             raw: Return the network's own disparities without any post-processing.
 
         Raises:
@@ -170,18 +173,20 @@ class Matcher:
         return [self.finish(pair, own, refined=refined) for pair, own in zip(pairs, found, strict=True)]
 
     def finish(self, pair: StereoPair, found: Estimate, *, refined: bool = False) -> Estimate:
-        """Post-process the network's estimate: refine it, fill occluded pixels and smooth streaks.
+        """Post-process the network's estimate.
 
-        The first step refines to subpixel accuracy. If `refined` or the matcher's preset requests it,
-        `refine.refine` then matches the pair once more. Streaks are smoothed beyond the other picture. The
-        preset finally corrects edges and speckles (`vote_at_edges`).
+        If `refined` or the matcher's mode requests it, `refine.refine` matches the pair once more. Visible
+        disparities are then refined to a fraction of a pixel, occluded pixels filled and streaks beyond the
+        other picture smoothed. Refined estimates finally get edges that follow the image.
         """
-        found = to_subpixel(pair.left, pair.right, found, self.threads)
-        if refined or self.refines:
+        refined = refined or self.refines
+        if refined:
             found = refine(pair.left, pair.right, found, self.threads)
-            found = to_subpixel(pair.left, pair.right, found, self.threads)
+        found = to_subpixel(pair.left, pair.right, found, self.threads)
         found = smooth_streaks(fill_occluded(found, pair.left_seen))
-        return vote_at_edges(pair.left, found, self.threads) if self.refines else found
+        if self.votes:
+            return vote_at_edges(pair.left, found, self.threads)
+        return sharpen_edges(pair.left, found, self.threads) if refined else found
 
     def _check_sizes(self, pairs: Sequence[StereoPair]) -> None:
         sizes = sorted({pair.left.shape[:2] for pair in pairs})
@@ -355,7 +360,7 @@ def _weights_folder() -> Path:
 
 
 def model_file(model: str | Path) -> Path:
-    """Return the path of the .onnx file for the name of a network or preset, or for a path.
+    """Return the path of the .onnx file for the name of a network or mode, or for a path.
 
     Raises:
         MatcherError: The model is unknown or its file does not exist.
@@ -368,10 +373,8 @@ def model_file(model: str | Path) -> Path:
         return path
     name = MODES[str(model)].network if str(model) in MODES else str(model)
     if name not in shipped_models():
-        raise MatcherError(
-            f"unknown model {name!r}; expected {', '.join(shipped_models())}, {', '.join(MODES)} or "
-            "the path of an .onnx file"
-        )
+        names = ", ".join(sorted({*shipped_models(), *MODES}))
+        raise MatcherError(f"unknown model {name!r}; expected {names} or the path of an .onnx file")
     return _weights_folder() / f"{name}.onnx"
 
 

@@ -18,8 +18,8 @@ class MatchOptions:
         range_px: Least and greatest disparity of the left view in px; disparities outside the range are
             clipped and get confidence 0. Default: the network's range, extended if the pair exceeds it.
         refined: Match once more at full resolution with the network's disparity as prior, which is slower but
-            recovers thin structures and sharper edges.
-        raw: Return the network's disparity without subpixel refinement and occlusion filling.
+            recovers thin structures and sharper edges. `base` and `best` always do.
+        raw: Return the network's disparity without any refinement and occlusion filling.
 
     Raises:
         StereoweaveError: `range_px` is not two finite numbers in ascending order, or both `refined` and `raw`

@@ -45,9 +45,9 @@ def estimate(  # noqa: PLR0913 - all but the images are keyword-only and optiona
             tensor, of uint8, uint16 or floats in 0..1; see `arrays.as_rgb`.
         right: Right image of the same size. Default: `left` is the path of one file with both views, such as
             a spatial photo; the estimate then holds the pair, with its camera if the file tells it.
-        model: Name of a shipped network, `best`, or the path of an .onnx matcher file. `best` runs the
-            network `base`, runs it again at up to 1.5 times the size, and refines the result. The network is
-            loaded on the first call and cached.
+        model: Name of a shipped network, `best`, or the path of an .onnx matcher file. `base` is always
+            refined; `best` runs it again at up to 1.5 times the size and settles edges by vote. The network
+            is loaded on the first call and cached.
         threads: Maximum number of threads; default: all cores.
         provider: Execution provider: cpu, cuda, tensorrt, openvino, coreml or directml.
         refined: See `MatchOptions`.

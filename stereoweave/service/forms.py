@@ -109,7 +109,9 @@ class PairForm(BaseModel):
 class MapForm(PairForm):
     """Fields of a request for disparity or depth."""
 
-    refined: Annotated[bool, Field(description="Match once more at full resolution.")] = False
+    refined: Annotated[
+        bool, Field(description="Match once more at full resolution; base and best always do.")
+    ] = False
     file: Annotated[
         Literal["png", "pfm", "npy", "tiff"],
         Field(description="png: 16 bits, px * 256 or millimetres; the others: float32."),

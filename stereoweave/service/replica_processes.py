@@ -49,7 +49,7 @@ class ReplicaProcesses:
         self._answerer.close()
 
     def warm_up(self) -> float:
-        """Compile all kernels, and return the time in seconds per megapixel for an unrefined disparity map.
+        """Compile all kernels, and return the time in seconds per megapixel for a disparity map.
 
         Raises:
             MatcherError: If the network cannot be loaded.

@@ -18,9 +18,8 @@ from stereoweave.io.maps import write_pfm
 from stereoweave.io.output_lock import lock_output
 from stereoweave.learn.data import collage
 from stereoweave.learn.data.sources import VALIDATION_SEED
-from stereoweave.matching.matcher import shipped_models
 
-NETWORKS = [name + how for name in shipped_models() for how in ("", " refined")]
+NETWORKS = ["base", "small", "small refined"]  # base always refines
 OPENCV = ["sgbm", "sgbm_8_paths", "sgbm_3_way", "bm"]
 COLUMNS = (
     "matcher,scene,epe_px,bad1_percent,bad2_percent,d1_percent,edge_epe_px,edge_bad1_percent,flying_percent,"

@@ -8,9 +8,8 @@ from stereoweave.cli.root import main
 from stereoweave.data.packing import pack
 from stereoweave.data.shards import write_shard
 from stereoweave.io.images import write_image
-from stereoweave.matching.matcher import shipped_models
 
-NETWORKS = [name + how for name in shipped_models() for how in ("", " refined")]
+NETWORKS = ["base", "small", "small refined"]  # base always refines
 
 COLUMNS = (
     "scene,position,method,psnr_db,ssim,mae,smooth_psnr_db,smooth_mae,edge_psnr_db,edge_mae,one_psnr_db,"

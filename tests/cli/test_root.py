@@ -18,7 +18,6 @@ from stereoweave.cli.options import find_allowed_hosts, listen
 from stereoweave.cli.root import main
 from stereoweave.io.images import read_image
 from stereoweave.io.maps import read_disparity_png, read_pfm
-from stereoweave.matching.matcher import shipped_models
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 TEXTURED = Path(__file__).resolve().parents[1] / "textured_pair"
@@ -442,7 +441,7 @@ def test_bench_scores_the_network_beside_sgbm(pictures, capfd):
 def test_bench_scores_every_shipped_network_and_names_the_file_of_the_rows(mistakes, capfd):
     assert run("bench pairs scenes") == 0
     with Path("pairs.csv").open() as file:
-        networks = [name + how for name in shipped_models() for how in ("", " refined")]
+        networks = {"base", "small", "small refined"}  # base always refines
         assert {row["matcher"] for row in csv.DictReader(file)} == {*OPENCV_MATCHERS, *networks}
     assert capfd.readouterr().out.endswith("rows: pairs.csv\n")
 

@@ -11,9 +11,8 @@ from stereoweave.errors import StereoweaveError
 from stereoweave.io.images import read_pair
 from stereoweave.matching import estimate as matching
 from stereoweave.matching import matcher as matcher_module
-from stereoweave.matching.edge_vote.vote import vote_at_edges
 from stereoweave.matching.estimate import match, match_many
-from stereoweave.matching.matcher import Matcher
+from stereoweave.matching.matcher import Matcher, model_file
 from stereoweave.matching.options import MatchOptions
 from stereoweave.matching.providers import PROVIDERS
 
@@ -198,7 +197,7 @@ def test_best_is_base_at_one_and_a_half_times_the_size_and_refined(best, part):
     found = sw.estimate(part.left, part.right, model="best")
     larger = (cv2.resize(x, (240, 144), interpolation=cv2.INTER_CUBIC) for x in (part.left, part.right))
     larger = tuple(larger)
-    expected = vote_at_edges(larger[0], sw.estimate(*larger, model="base", refined=True))
+    expected = Matcher("best").estimate(*larger)
     expected_px = cv2.resize(expected.disparity_px, (160, 96), interpolation=cv2.INTER_NEAREST_EXACT) / 1.5
     assert found.disparity_px.shape == found.confidence.shape == found.occluded.shape == (96, 160)
     # Everything agrees except what a median over 3x3 px changes.
@@ -206,8 +205,18 @@ def test_best_is_base_at_one_and_a_half_times_the_size_and_refined(best, part):
     same(match_many(best, [part])[0], found)
 
 
-def test_best_is_always_refined(best, part):
-    same(match(best, part, MatchOptions(refined=True)), match(best, part))
+@pytest.mark.parametrize("name", ["base", "best"])
+def test_base_and_best_are_always_refined(part, name):
+    matcher = Matcher(name)
+    same(match(matcher, part, MatchOptions(refined=True)), match(matcher, part))
+
+
+def test_other_networks_and_files_are_refined_on_request(part):
+    file = Matcher(model_file("base"))
+    same(match(file, part, MatchOptions(refined=True)), match(Matcher("base"), part))
+    for matcher in (file, Matcher("small")):
+        plain, refined = (match(matcher, part, MatchOptions(refined=how)) for how in (False, True))
+        assert (plain.disparity_px != refined.disparity_px).any()
 
 
 def test_the_best_estimate_mixes_no_surfaces():

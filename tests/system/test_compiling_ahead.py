@@ -96,7 +96,10 @@ RENDERING = {"background_kernels", "draw_kernels", "hole_filling_kernels"}
         ("depth pairs --raw -o many", set()),
         ("depth pairs -o many", {"refine_kernels", "vote_kernels"}),
         ("depth pairs/one/left.png pairs/one/right.png --raw -o out", RENDERING),
-        ("view pairs/one/left.png pairs/one/right.png --layout rgbd -o view.png", {"refine_kernels"}),
+        (
+            "view pairs/one/left.png pairs/one/right.png --layout rgbd -o view.png",
+            {"refine_kernels", "vote_kernels"},
+        ),
     ],
     ids=["no report, raw", "no report", "raw", "no view"],
 )

@@ -63,18 +63,18 @@ def sharpen_edges(
 ) -> Estimate:
     """Replace the left disparities at edges by their neighbours' vote, but for thin things.
 
-    Confidences do not change. This takes half the time of `vote_at_edges`, which removes thin things as
-    speckles.
+    Confidences do not change. One round is enough, because an edge is narrower than the vote's reach. This
+    takes half the time of `vote_at_edges`, which removes thin things as speckles.
 
     Args:
         image: Left image, uint8 RGB [H, W, 3].
         estimate: The pair's estimate.
         threads: Maximum number of threads; default: all cores.
     """
-    disparity_px = np.asarray(estimate.disparity_px, np.float32)
+    disparity_px = np.array(estimate.disparity_px, np.float32)
     unsound = _find_steps(disparity_px) & ~_find_thin(image, disparity_px, estimate.confidence)
-    sharp_px, _ = _vote(image, estimate, unsound, threads)
-    return replace(estimate, disparity_px=sharp_px)
+    _vote_once(_to_lab(image), disparity_px, np.array(estimate.confidence, np.float32), unsound, threads)
+    return replace(estimate, disparity_px=disparity_px)
 
 
 def rehearse_voting() -> None:
@@ -91,18 +91,14 @@ def _vote(
     threads: int | None,
 ) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
     """Return the disparities and confidences after all rounds; `unsound` keeps the pixels without a vote."""
-    from stereoweave.matching.edge_vote.vote_kernels import vote  # it loads LLVM
-
-    lab = cv2.cvtColor(image.astype(np.float32) / 255, cv2.COLOR_RGB2LAB)
+    lab = _to_lab(image)
     disparity_px = np.array(estimate.disparity_px, np.float32)
     claimed = np.array(estimate.confidence, np.float32)
     confidence = claimed.copy()
     kept = ~unsound
-    bands = thread_count(threads)
     for _ in range(_ROUNDS):
-        before_px, trust, sound = disparity_px.copy(), confidence.copy(), ~unsound
-        work = partial(vote, lab, before_px, trust, sound, disparity_px, confidence, unsound)
-        in_bands(work, len(disparity_px), bands, bands)
+        sound = ~unsound
+        _vote_once(lab, disparity_px, confidence, unsound, threads)
         voted = ~(sound | unsound)
         least = np.where(estimate.occluded[voted], _OCCLUDED, _SEEN)
         confidence[voted] = least + _SHARE_AGREED * confidence[voted] + _SHARE_CLAIMED * claimed[voted]
@@ -112,6 +108,30 @@ def _vote(
     # Nothing is known where there is no content or no texture.
     confidence[claimed == 0] = 0
     return disparity_px, confidence
+
+
+def _to_lab(image: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
+    return cv2.cvtColor(image.astype(np.float32) / 255, cv2.COLOR_RGB2LAB)
+
+
+def _vote_once(
+    lab: Float32[np.ndarray, "h w 3"],
+    disparity_px: Float32[np.ndarray, "h w"],
+    confidence: Float32[np.ndarray, "h w"],
+    unsound: Bool[np.ndarray, "h w"],
+    threads: int | None,
+) -> None:
+    """Replace unsound disparities, and their confidences by the neighbours' agreement, in place.
+
+    Pixels with a vote are removed from `unsound`.
+    """
+    from stereoweave.matching.edge_vote.vote_kernels import vote  # it loads LLVM
+
+    work = partial(
+        vote, lab, disparity_px.copy(), confidence.copy(), ~unsound, disparity_px, confidence, unsound
+    )
+    count = thread_count(threads)
+    in_bands(work, len(disparity_px), count, count)
 
 
 def _find_unsound(
