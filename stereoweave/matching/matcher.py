@@ -373,7 +373,7 @@ def model_file(model: str | Path) -> Path:
         return path
     name = MODES[str(model)].network if str(model) in MODES else str(model)
     if name not in shipped_models():
-        names = ", ".join(sorted({*shipped_models(), *MODES}))
+        names = ", ".join(dict.fromkeys([*shipped_models(), *MODES]))
         raise MatcherError(f"unknown model {name!r}; expected {names} or the path of an .onnx file")
     return _weights_folder() / f"{name}.onnx"
 

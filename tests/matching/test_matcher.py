@@ -187,7 +187,7 @@ def test_the_number_of_threads_is_honoured():
 
 
 def test_an_unknown_name_lists_the_shipped_ones():
-    with pytest.raises(sw.MatcherError, match="unknown model 'tiny'; expected base, best, small or the path"):
+    with pytest.raises(sw.MatcherError, match="unknown model 'tiny'; expected base, small, best or the path"):
         Matcher("tiny")
 
 
