@@ -20,9 +20,10 @@ from stereoweave.errors import MatcherError, StereoweaveError
 from stereoweave.io.images import SMALLEST_SIDE_PX
 from stereoweave.matching.edge_vote.vote import sharpen_edges, vote_at_edges
 from stereoweave.matching.left_right_check import OCCLUSION_STEP_PX, is_occluded, measure_disagreement
+from stereoweave.matching.network import Network
 from stereoweave.matching.occlusion_fill import fill_occluded
 from stereoweave.matching.options import MatchOptions
-from stereoweave.matching.providers import CPU, PROVIDERS, explain_failure, open_session
+from stereoweave.matching.providers import CPU, PROVIDERS
 from stereoweave.matching.refine import refine
 from stereoweave.matching.streaks import smooth_streaks
 from stereoweave.matching.subpixel import to_subpixel
@@ -102,12 +103,12 @@ class Matcher:
         self.magnification = mode.magnification if mode else 1.0
         self.refines = mode is not None
         self.votes = mode is not None and mode.voted
-        self._session = open_session(self._path, provider, thread_count(threads))
+        self._network = Network(self._path, provider, thread_count(threads))
         try:
             self._outputs = self._read_outputs()
             self.name, self.multiple_of, self.max_disparity_px = self._read_properties()
             # Free dimensions have names instead of numbers, and a file may omit the shape altogether.
-            shape: list[Any] = [*self._session.get_inputs()[0].shape, *["any"] * 4]
+            shape: list[Any] = [*self._network.session.get_inputs()[0].shape, *["any"] * 4]
         except UnicodeDecodeError as error:
             raise MatcherError(
                 f"{self._path}: expected metadata in UTF-8, found bytes in another encoding"
@@ -257,9 +258,8 @@ class Matcher:
         height, width = pairs[0][0].shape[:2]
         (above, _), (before, _) = self._borders_px(height, width)
         inputs = {"left": self._tensor([x for x, _ in pairs]), "right": self._tensor([x for _, x in pairs])}
-        pixel_pairs = len(pairs) * height * width * width
-        with explain_failure(self.provider, self._path):
-            values = self._session.run(self._outputs, inputs, self._run_options(pixel_pairs))
+        release = len(pairs) * height * width * width > _KEPT_PIXEL_PAIRS
+        values = self._network.run(self._outputs, inputs, release)
         outputs = dict(zip(self._outputs, values, strict=True))
         self._check_outputs(outputs, [len(pairs), 1, *inputs["left"].shape[2:]])
         return [
@@ -280,15 +280,6 @@ class Matcher:
                 )
             if not np.isfinite(value).all():
                 raise MatcherError(f"{self._path}: expected finite values in {name}, found NaN or infinity")
-
-    def _run_options(self, pixel_pairs: int) -> Any:
-        """Return options that keep the memory arena for the next run but release it after very large runs."""
-        import onnxruntime  # type: ignore[import-untyped]
-
-        options = onnxruntime.RunOptions()
-        if self.provider == CPU and pixel_pairs > _KEPT_PIXEL_PAIRS:
-            options.add_run_config_entry("memory.enable_memory_arena_shrinkage", "cpu:0")
-        return options
 
     def _run_size(self, height: int, width: int) -> tuple[int, int]:
         """Return the height and width of the network's input for an image of this size."""
@@ -316,8 +307,8 @@ class Matcher:
 
     def _read_outputs(self) -> list[str]:
         """Validate the graph's inputs and outputs; return the names of the outputs listed in `Maps`."""
-        inputs = {value.name: value.type for value in self._session.get_inputs()}
-        outputs = {value.name: value.type for value in self._session.get_outputs()}
+        inputs = {value.name: value.type for value in self._network.session.get_inputs()}
+        outputs = {value.name: value.type for value in self._network.session.get_outputs()}
         used = [name for name in Maps._fields if name in outputs]
         all_float32 = all(outputs[name] == _FLOAT32 for name in used)
         if inputs != {"left": _FLOAT32, "right": _FLOAT32} or "disparity_px" not in used or not all_float32:
@@ -329,7 +320,7 @@ class Matcher:
 
     def _read_properties(self) -> tuple[str, int, float]:
         """Read name, multiple_of and max_disparity_px from the file's metadata."""
-        metadata = self._session.get_modelmeta().custom_metadata_map
+        metadata = self._network.session.get_modelmeta().custom_metadata_map
         keys = [f"stereoweave.{key}" for key in ("name", "multiple_of", "max_disparity_px")]
         try:
             name, multiple_of, max_disparity_px = (metadata[key] for key in keys)

@@ -9,10 +9,11 @@ import contextlib
 import importlib
 import io
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from stereoweave.arguments import check_kind
@@ -160,6 +161,21 @@ def open_session(path: Path, provider: str, threads: int) -> Any:
     return session
 
 
+def open_session_of_size(graph: bytes, path: Path, threads: int, sizes: Mapping[str, int]) -> Any:
+    """Open a session on the CPU for inputs of one size.
+
+    Args:
+        graph: Contents of the matcher file.
+        path: Its path, for errors.
+        threads: Number of threads.
+        sizes: Sizes of the free dimensions, by name.
+
+    Raises:
+        MatcherError: The network cannot have these sizes.
+    """
+    return _create_session(path, CPU, threads, graph, sizes)
+
+
 @contextmanager
 def explain_failure(provider: str, path: Path) -> Iterator[None]:
     """Turn exceptions during a run into one-line errors that blame the provider or the matcher file."""
@@ -177,7 +193,13 @@ def explain_failure(provider: str, path: Path) -> Iterator[None]:
         ) from error
 
 
-def _create_session(path: Path, provider: str, threads: int) -> Any:
+def _create_session(
+    path: Path,
+    provider: str,
+    threads: int,
+    graph: bytes | None = None,
+    sizes: Mapping[str, int] = MappingProxyType({}),
+) -> Any:
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
@@ -186,6 +208,8 @@ def _create_session(path: Path, provider: str, threads: int) -> Any:
     # By default, the threads keep spinning after a run and slow down other work on the same cores.
     options.add_session_config_entry("session.force_spinning_stop", "1")
     options.log_severity_level = 4  # the error below reports problems with the file
+    for name, size in sizes.items():
+        options.add_free_dimension_override_by_name(name, size)
     if provider != CPU:
         options.add_session_config_entry("session.record_ep_graph_assignment_info", "1")
         options.enable_mem_pattern = provider != "directml"  # DirectML does not support it
@@ -195,7 +219,9 @@ def _create_session(path: Path, provider: str, threads: int) -> Any:
     providers = [(PROVIDERS[name].name, PROVIDERS[name].options(threads)) for name in names]
     try:
         # Do not fall back to the CPU if the provider fails.
-        return onnxruntime.InferenceSession(str(path), options, providers=providers, enable_fallback=0)
+        return onnxruntime.InferenceSession(
+            graph or str(path), options, providers=providers, enable_fallback=0
+        )
     except Exception as error:  # no common base class, as above
         raise _file_error(path, error) from error
 

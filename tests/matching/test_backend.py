@@ -9,7 +9,7 @@ from matcher_examples import matcher_file, painted, red_of
 
 import stereoweave as sw
 from stereoweave.errors import MatcherError, StereoweaveError
-from stereoweave.matching import matcher as matcher_module
+from stereoweave.matching import network
 from stereoweave.matching.backend import Backend
 
 
@@ -23,10 +23,8 @@ def test_equal_backends_share_one_loaded_network_and_different_ones_do_not():
 
 def test_a_model_is_loaded_once_and_kept(tmp_path, rng, monkeypatch):
     opened = []
-    open_session = matcher_module.open_session
-    monkeypatch.setattr(
-        matcher_module, "open_session", lambda *given: opened.append(given) or open_session(*given)
-    )
+    open_session = network.open_session
+    monkeypatch.setattr(network, "open_session", lambda *given: opened.append(given) or open_session(*given))
     file = tmp_path / "matcher.onnx"
     matcher_file(file, red_of("left", "disparity_px"), ["disparity_px"])
     left, right = rng.integers(0, 256, (2, 32, 32, 3), np.uint8)

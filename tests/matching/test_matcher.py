@@ -183,7 +183,7 @@ def test_low_and_very_wide_pictures_do_not_fit_one_run(both_views):
 
 
 def test_the_number_of_threads_is_honoured():
-    assert Matcher("small", threads=1)._session.get_session_options().intra_op_num_threads == 1
+    assert Matcher("small", threads=1)._network.session.get_session_options().intra_op_num_threads == 1
 
 
 def test_an_unknown_name_lists_the_shipped_ones():
