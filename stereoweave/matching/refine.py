@@ -1,10 +1,10 @@
 """Refinement of an estimate by matching once more at full resolution, with the network's disparity as prior.
 
-The method is semi-global matching (Hirschmueller 2008) over all disparities between the network's least and
-greatest disparity, at and around pixels of which the network is not certain. A candidate's cost is the colour
-and census difference, plus the confidence-weighted distance to the network's disparity. Disparities on which
-both views agree replace the network's disparities. This recovers edges, as well as thin structures that are
-below the network's resolution.
+The method is semi-global matching (Hirschmueller 2008) at and around pixels of which the network is not
+certain, over all disparities between the network's least and greatest disparity nearby. A candidate's cost is
+the colour and census difference, plus the confidence-weighted distance to the network's disparity. Where both
+views agree, the found disparities replace the network's. This recovers edges, as well as thin structures that
+are below the network's resolution.
 """
 
 import math
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, UInt8, UInt16
+from jaxtyping import Bool, Float, Float32, Int32, UInt8
 
 from stereoweave.matching.exposure import match_exposure, recolour
 from stereoweave.matching.left_right_check import at_match, find_occluded
@@ -21,14 +21,14 @@ from stereoweave.system.steps import step
 from stereoweave.system.threads import in_bands, thread_count
 
 if TYPE_CHECKING:
-    from stereoweave.matching.refine_kernels import Cues
+    from stereoweave.matching.refine_kernels import Cues, Search
 
 # Candidates extend this far beyond the estimate's disparities; their number is a multiple of the vector
 # length.
 _MARGIN_PX = 4
 _CANDIDATES_MULTIPLE = 16
-# Each candidate of a pixel takes 3 bytes, so larger images are refined in strips, which overlap by this many
-# rows on each side.
+# Each candidate of a searched pixel takes 3 bytes, so larger images are refined in strips, which overlap by
+# this many rows on each side.
 _CANDIDATES_AT_ONCE = 100_000_000
 _OVERLAP_PX = 24
 # Penalty for a large disparity step: greatest between equal grey levels, halved at this grey difference.
@@ -38,6 +38,9 @@ _HALVING_LEVELS = 30
 # New views gain 0.1 dB from a search everywhere, and lose 0.3 dB without the pixels around.
 _REACH_PX = 4
 _AROUND = np.ones((2 * _REACH_PX + 1, 2 * _REACH_PX + 1), np.uint8)
+_BESIDE = np.ones((1, 3), np.uint8)
+# The candidates of a tile are the disparities in it and in the 24 tiles around it.
+_TILES_AROUND = np.ones((5, 5), np.uint8)
 # Factor on a pixel's confidence where the network's disparities for the two views disagree.
 _DOUBTED = 0.2
 _SAME_PX = 1.0
@@ -50,17 +53,19 @@ class _View(NamedTuple):
     Attributes:
         own: Cues of the view.
         other: Cues of the other image, aligned for the kernels.
+        searched: Pixels whose disparity is searched; elsewhere the network's is certain.
         towards: -1 for the left view, whose matches are to the left, and 1 for the right view.
     """
 
     own: "Cues"
     other: "Cues"
+    searched: Bool[np.ndarray, "h w"]
     towards: int
 
     def take(self, rows: slice) -> "_View":
         """Return a strip of rows of the view."""
         own, other = (type(cues)(*(cue[rows] for cue in cues)) for cues in self[:2])
-        return _View(own, other, self.towards)
+        return _View(own, other, self.searched[rows], self.towards)
 
 
 @step("refining")
@@ -109,9 +114,11 @@ def find_matching_costs(pair: StereoPair, count: int) -> UInt8[np.ndarray, "h w 
 
     nothing = np.zeros(pair.left.shape[:2], np.float32)
     own, other = (_cues(image, nothing, nothing) for image in (pair.left, pair.right))
-    costs = np.empty((*nothing.shape, count), np.uint8)
-    kernels.match(own, _align(other, 0, count, -1), -1, 0, len(costs), costs)
-    return costs
+    tiles = _tiles(nothing.shape)
+    search, size = _lay_out(np.zeros(tiles, np.int32), np.full(tiles, count, np.int32), nothing == 0)
+    costs = np.empty(size, np.uint8)
+    kernels.match(own, _align(other, 0, count, -1), search, -1, 0, len(nothing), costs)
+    return costs.reshape(*nothing.shape, count)
 
 
 def rehearse_refining() -> None:
@@ -144,50 +151,42 @@ def _match_views(
     first_px, count = _candidates(estimate)
     left = _cues(pair.left, estimate.disparity_px - first_px, estimate.confidence)
     right = _cues(pair.right, estimate.right_disparity_px - first_px, right_trust)
-    views = [
-        _View(left, _align(right, first_px, count, -1), -1),
-        _View(right, _align(left, first_px, count, 1), 1),
-    ]
-    height, width = left.grey.shape
-    found_px = np.empty((2, height, width), np.float32)
+    searched, right_searched = find_searched(estimate.confidence), find_searched(right_trust)
+    left_view = _View(left, _align(right, first_px, count, -1), searched, -1)
+    found_px = _match_view(left_view, first_px, count, threads)
+    right_view = _View(right, _align(left, first_px, count, 1), right_searched, 1)
+    return found_px, _match_view(right_view, first_px, count, threads)
+
+
+def _match_view(view: _View, first_px: int, count: int, threads: int) -> Float32[np.ndarray, "h w"]:
+    """Match a view, a large one in strips of rows."""
+    height, width = view.searched.shape
+    found_px = np.empty((height, width), np.float32)
     step = max(_CANDIDATES_AT_ONCE // (width * count), 4 * _OVERLAP_PX) - 2 * _OVERLAP_PX
     for top in range(0, height, step):
         rows = slice(max(top - _OVERLAP_PX, 0), min(top + step + _OVERLAP_PX, height))
-        strip = [view.take(rows) for view in views]
-        strip_px = _match_strip(strip, first_px, count, threads)
-        found_px[:, top : top + step] = strip_px[:, top - rows.start :][:, :step]
-    return found_px[0], found_px[1]
+        strip_px = _match_strip(view.take(rows), first_px, count, threads)
+        found_px[top : top + step] = strip_px[top - rows.start :][:step]
+    return found_px
 
 
-def _match_strip(views: list[_View], first_px: int, count: int, threads: int) -> Float32[np.ndarray, "2 h w"]:
-    """Match a strip of rows of both views."""
-    size = (*views[0].own.grey.shape, count)
-    # Both views share the buffers, because allocating new memory takes as long as aggregating one path.
-    costs, sums = np.empty(size, np.uint8), np.empty(size, np.uint16)
-    return np.stack([_match_view(view, (costs, sums), first_px, threads) for view in views])
-
-
-def _match_view(
-    view: _View,
-    volumes: tuple[UInt8[np.ndarray, "h w d"], UInt16[np.ndarray, "h w d"]],
-    first_px: int,
-    threads: int,
-) -> Float32[np.ndarray, "h w"]:
-    """Match a view; `volumes` are buffers for the matching costs and their sums over all paths."""
+def _match_strip(strip: _View, first_px: int, count: int, threads: int) -> Float32[np.ndarray, "h w"]:
+    """Match a strip of rows of a view."""
     from stereoweave.matching import refine_kernels as kernels
 
-    own, other, towards = view
+    own, other, _, towards = strip
     height, width = own.grey.shape
-    costs, sums = volumes
+    search, size = _search(strip, count)
+    costs, sums = np.empty(size, np.uint8), np.empty(size, np.uint16)
     steps_along, steps_down = (_large_steps(own.grey, axis) for axis in (1, 0))
     found_px = first_px + own.prior / np.float32(kernels.SUBSTEPS)
 
     def match(first: int, last: int) -> None:
-        kernels.match(own, other, towards, first, last, costs)
-        kernels.along_rows(costs, own, steps_along, first, last, sums)
+        kernels.match(own, other, search, towards, first, last, costs)
+        kernels.along_rows(costs, own, search, steps_along, count, first, last, sums)
 
     def pick(first: int, last: int) -> None:
-        kernels.along_columns(costs, own, steps_down, first_px, first, last, sums, found_px)
+        kernels.along_columns(costs, own, search, steps_down, count, first_px, first, last, sums, found_px)
 
     in_bands(match, height, threads, threads)
     in_bands(pick, width, threads, threads)
@@ -205,41 +204,90 @@ def _candidates(estimate: Estimate) -> tuple[int, int]:
     return first_px, count + -count % _CANDIDATES_MULTIPLE
 
 
+def find_searched(trust: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Return the mask of the pixels whose disparity is searched: those that are not certain, and around."""
+    from stereoweave.matching import refine_kernels as kernels  # it loads LLVM
+
+    return cv2.dilate((trust < kernels.CERTAIN).astype(np.uint8), _AROUND) > 0
+
+
+def _search(view: _View, count: int) -> tuple["Search", int]:
+    """Choose each tile's candidates among `count` ones; also return their number, summed over all pixels."""
+    from stereoweave.matching import refine_kernels as kernels
+
+    least, most = np.empty((2, *_tiles(view.searched.shape)), np.uint16)
+    kernels.find_ends(view.own.prior, least, most)
+    least, most = cv2.erode(least, _TILES_AROUND), cv2.dilate(most, _TILES_AROUND)
+    firsts = np.maximum(least.astype(np.int32) // kernels.SUBSTEPS - _MARGIN_PX, 0)
+    counts = most.astype(np.int32) // kernels.SUBSTEPS + _MARGIN_PX + 2 - firsts
+    counts = np.minimum(counts + -counts % _CANDIDATES_MULTIPLE, count)
+    return _lay_out(np.minimum(firsts, count - counts), counts, view.searched)
+
+
+def _tiles(size: tuple[int, ...]) -> tuple[int, ...]:
+    """Return the number of tiles in each column and row of an image."""
+    from stereoweave.matching import refine_kernels as kernels
+
+    return tuple(math.ceil(length / kernels.TILE_PX) for length in size)
+
+
+def _lay_out(
+    firsts: Int32[np.ndarray, "h w"], counts: Int32[np.ndarray, "h w"], searched: Bool[np.ndarray, "h2 w2"]
+) -> tuple["Search", int]:
+    """Place the candidates of the searched pixels one after the other; also return their total number."""
+    from stereoweave.matching import refine_kernels as kernels
+
+    search = kernels.Search(np.empty(searched.shape, np.int64), firsts, counts)
+    total = np.empty(1, np.int64)
+    kernels.lay_out(searched, search, total)
+    return search, int(total[0])
+
+
 def _cues(image: UInt8[np.ndarray, "h w 3"], above_first_px: np.ndarray, trust: np.ndarray) -> "Cues":
     from stereoweave.matching import refine_kernels as kernels
 
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     codes = np.empty(grey.shape, np.uint32)
     kernels.census(grey, codes)
-    colour = np.ascontiguousarray(image.transpose(0, 2, 1))
-    around = np.pad(colour, ((0, 0), (0, 0), (1, 1)), mode="edge").astype(np.uint16)
-    halfway = ((around[..., 1:] + around[..., :-1]) // 2).astype(np.uint8)
+    colour = np.stack(cv2.split(image), 1)
+    rows = colour.reshape(-1, grey.shape[1])
     return kernels.Cues(
         grey=grey,
         census=codes,
         colour=colour,
-        darkest=np.minimum(colour, np.minimum(halfway[..., :-1], halfway[..., 1:])),
-        brightest=np.maximum(colour, np.maximum(halfway[..., :-1], halfway[..., 1:])),
+        darkest=_halfway(colour, cv2.erode(rows, _BESIDE).reshape(colour.shape)),
+        brightest=_halfway(colour, cv2.dilate(rows, _BESIDE).reshape(colour.shape)),
         prior=np.rint(above_first_px * kernels.SUBSTEPS).astype(np.uint16),
         trust=np.rint(trust * kernels.MOST_TRUST).astype(np.uint16),
-        searched=cv2.dilate((trust < kernels.CERTAIN).astype(np.uint8), _AROUND) > 0,
     )
+
+
+def _halfway(levels: UInt8[np.ndarray, "*size"], others: UInt8[np.ndarray, "*size"]) -> np.ndarray:
+    """Return the mean of both levels, rounded down."""
+    return (levels & others) + ((levels ^ others) >> 1)
 
 
 def _align(cues: "Cues", first_px: int, count: int, towards: int) -> "Cues":
     """Place the other image's columns as the kernels read them, between copies of the border columns.
 
-    Only what the kernels read of the other image is placed: `grey` and `searched` stay as they are.
+    Only what the kernels read of the other image is placed: `grey` stays as it is.
     """
     width = cues.grey.shape[1]
     columns = first_px + np.arange(width + count - 1)
     inside = slice(*np.searchsorted(columns, [0, width]))
     placed = {
-        name: _place(cue[..., ::towards], columns, inside)
+        name: _place(cue if towards > 0 else _mirror(cue), columns, inside)
         for name, cue in cues._asdict().items()
-        if name not in ("grey", "searched")
+        if name != "grey"
     }
     return cues._replace(**placed)
+
+
+def _mirror(cue: np.ndarray) -> np.ndarray:
+    """Return the cue with its columns reversed; three times as fast as NumPy's copy of a reversed view."""
+    # OpenCV has no uint32.
+    rows = cue.reshape(-1, cue.shape[-1]).view(f"i{cue.itemsize}")
+    return cv2.flip(rows, 1).view(cue.dtype).reshape(cue.shape)
 
 
 def _place(cue: np.ndarray, columns: np.ndarray, inside: slice) -> np.ndarray:

@@ -1,8 +1,9 @@
 """Numba kernels of `refine`, in the order in which they are called; `pick` is for bench/classical alone.
 
-The plain reference implementation is tests/helpers/plain_refining.py. Volumes are [H, W, D]. Candidate i is
-the disparity first_px + i. For a left view, the columns of the other image's `Cues` are reversed, so that the
-candidates of column x, at W - 1 - x + i, are contiguous in memory; for a right view they are at x + i.
+The plain reference implementation is tests/helpers/plain_refining.py. Candidate i is the disparity
+first_px + i. `Search` says which candidates of a pixel are searched; a volume holds those of one pixel after
+the other. For a left view, the columns of the other image's `Cues` are reversed, so that the candidates of
+column x, at W - 1 - x + i, are contiguous in memory; for a right view they are at x + i.
 """
 
 import typing
@@ -11,6 +12,8 @@ import numpy as np
 
 from stereoweave.system.jit import inlined, kernel
 
+TILE_PX = 32
+"""Side of the square tiles whose pixels have the same candidates."""
 SUBSTEPS = 8
 """Number of steps per px in which a candidate's distance to the network's disparity is measured."""
 DOUBTLESS, FARTHEST = np.uint16(SUBSTEPS), np.uint16(8 * SUBSTEPS)
@@ -32,10 +35,11 @@ SLACK_PX = 2
 LARGEST_MOVE_PX = 24
 """Border disparities that differ from the surface's by more than this belong to another surface."""
 _CENSUS_RADIUS = 2
-_NEVER = np.uint16(30000)
+_NEVER, _HIGHEST = np.uint16(30000), np.uint16(65535)
 _SIX = np.uint16(6)
 # Numba widens sums to 64 bits unless both operands are narrow; wide sums would halve the vectors' length.
-_ONE, _TWO, _FOUR, _TOP = (np.uint32(bits) for bits in (1, 2, 4, 24))
+_ONE, _TWO, _FOUR, _HALF, _TOP = (np.uint32(bits) for bits in (1, 2, 4, 16, 24))
+_LOW, _LARGEST = np.uint32(0xFFFF), np.uint32(0xFFFFFFFF)
 _PAIRS, _FOURS, _EIGHTS, _SUM = (np.uint32(mask) for mask in (0x55555555, 0x33333333, 0x0F0F0F0F, 0x01010101))
 
 
@@ -50,7 +54,6 @@ class Cues(typing.NamedTuple):
         brightest: uint8 [H, 3, W], greatest level within half a pixel to either side.
         prior: uint16, the network's disparity minus first_px in 1/SUBSTEPS px, up to 8191 px.
         trust: uint16, weight of the prior, 0..MOST_TRUST.
-        searched: bool, pixels whose disparity is searched; elsewhere the network's is certain.
     """
 
     grey: np.ndarray
@@ -60,7 +63,21 @@ class Cues(typing.NamedTuple):
     brightest: np.ndarray
     prior: np.ndarray
     trust: np.ndarray
-    searched: np.ndarray
+
+
+class Search(typing.NamedTuple):
+    """The candidates that are searched; C-contiguous arrays.
+
+    Attributes:
+        places: int64 [H, W], start of each pixel's candidates in the volumes; -1 where the network's
+            disparity is certain.
+        firsts: int32, first candidate of each tile.
+        counts: int32, number of candidates of each tile.
+    """
+
+    places: np.ndarray
+    firsts: np.ndarray
+    counts: np.ndarray
 
 
 @kernel
@@ -156,29 +173,58 @@ def _pull(prior, trust, candidate):
 
 @inlined
 @typing.no_type_check
-def _add_pulls(prior, trust, priors, trusts, costs):
+def _add_pulls(prior, trust, priors, trusts, first, costs):
     """Add the cost of each candidate's distance to the network's disparities in both views."""
     for i in range(costs.shape[0]):
-        candidate = np.uint16(SUBSTEPS * i)
+        candidate = np.uint16(SUBSTEPS * (first + i))
         pulls = _pull(prior, trust, candidate) + _pull(priors[i], trusts[i], candidate)
         costs[i] = np.uint8(costs[i] + pulls)
 
 
 @kernel
 @typing.no_type_check
-def match(own, other, towards, first, last, costs):
-    """Write the matching cost of each candidate at searched pixels into rows first..last of costs (uint8).
+def find_ends(prior, least, most):
+    """Write the least and the greatest prior of each tile."""
+    height, width = prior.shape
+    least[:], most[:] = _HIGHEST, 0
+    for y in range(height):
+        for x in range(width):
+            tile = y // TILE_PX, x // TILE_PX
+            least[tile], most[tile] = min(least[tile], prior[y, x]), max(most[tile], prior[y, x])
+
+
+@kernel
+@typing.no_type_check
+def lay_out(searched, search, total):
+    """Write the places of the `searched` pixels' candidates, one pixel after the other, and their number."""
+    height, width = searched.shape
+    place = 0
+    for y in range(height):
+        for x in range(width):
+            search.places[y, x] = place if searched[y, x] else -1
+            if searched[y, x]:
+                place += search.counts[y // TILE_PX, x // TILE_PX]
+    total[0] = place
+
+
+@kernel
+@typing.no_type_check
+def match(own, other, search, towards, first, last, costs):
+    """Write the matching costs (uint8) of the searched pixels of the image's rows first..last.
 
     towards is -1 for a left view, whose matches are to the left, and 1 for a right view.
     """
-    _, width, count = costs.shape
+    places, firsts, counts = search
+    width = places.shape[1]
     for y in range(first, last):
         for x in range(width):
-            if not own.searched[y, x]:
+            place = places[y, x]
+            if place < 0:
                 continue
-            start = x if towards > 0 else width - 1 - x
+            skipped, count = firsts[y // TILE_PX, x // TILE_PX], counts[y // TILE_PX, x // TILE_PX]
+            start = skipped + (x if towards > 0 else width - 1 - x)
             end = start + count
-            out = costs[y, x]
+            out = costs[place : place + count]
             _differences(
                 _at(own.colour, y, x),
                 _at(own.darkest, y, x),
@@ -190,7 +236,7 @@ def match(own, other, towards, first, last, costs):
             )
             _add_census(own.census[y, x], other.census[y, start:end], out)
             priors, trusts = other.prior[y, start:end], other.trust[y, start:end]
-            _add_pulls(own.prior[y, x], own.trust[y, x], priors, trusts, out)
+            _add_pulls(own.prior[y, x], own.trust[y, x], priors, trusts, skipped, out)
 
 
 @inlined
@@ -205,10 +251,21 @@ def _start(prior, path):
 
 @inlined
 @typing.no_type_check
+def _close(path, first, count):
+    """Write _NEVER to a path's costs of all candidates but `count` ones from `first`."""
+    for i in range(first + 1):
+        path[i] = _NEVER
+    for i in range(first + count + 1, path.shape[0]):
+        path[i] = _NEVER
+
+
+@inlined
+@typing.no_type_check
 def _step(before, least, costs, large_step, after, sums):
     """Advance a path by one pixel: write its costs into after, add them to sums and return the least cost."""
     limit = np.uint16(least + large_step)
     lowest = _NEVER
+    after[0] = after[costs.shape[0] + 1] = _NEVER
     for i in range(costs.shape[0]):
         beside = np.uint16(min(before[i], before[i + 2]) + np.uint16(SMALL_STEP))
         cost = np.uint16(min(min(before[i + 1], beside), limit) - least + np.uint16(costs[i]))
@@ -220,31 +277,46 @@ def _step(before, least, costs, large_step, after, sums):
 
 @kernel
 @typing.no_type_check
-def along_rows(costs, own, large_step, first, last, sums):
-    """Write the summed costs of the paths from the left and the right into rows first..last of sums.
+def along_rows(costs, own, search, large_step, levels, first, last, sums):
+    """Write the summed costs of the paths from the left and the right along the image's rows first..last.
 
-    Sums are of searched pixels alone. large_step [H, W] is the penalty for a large step from the previous
-    pixel to each pixel.
+    large_step [H, W] is the penalty for a large step from the previous pixel to each pixel. levels is the
+    number of all candidates.
     """
-    _, width, count = costs.shape
-    paths = np.empty((2, count + 2), np.uint16)
+    places, firsts, counts = search
+    width = places.shape[1]
+    paths = np.empty((2, levels + 2), np.uint16)
     for y in range(first, last):
         for backwards in range(2):
             paths[:] = 0
-            paths[:, 0] = paths[:, count + 1] = _NEVER
-            least, known = np.uint16(0), False
+            paths[:, 0] = paths[:, levels + 1] = _NEVER
+            least = np.uint16(0)
             for i in range(width):
                 x = width - 1 - i if backwards else i
-                if own.searched[y, x]:
-                    before, after = paths[i & 1], paths[1 - (i & 1)]
-                    if known:
-                        _start(own.prior[y, x - 1 + 2 * backwards], before)
-                        least = np.uint16(0)
-                    if not backwards:
-                        sums[y, x] = 0
-                    jump = large_step[y, min(x + backwards, width - 1)]
-                    least = _step(before, least, costs[y, x], jump, after, sums[y, x])
-                known = not own.searched[y, x]
+                place = places[y, x]
+                if place < 0:
+                    continue
+                skipped, count = firsts[y // TILE_PX, x // TILE_PX], counts[y // TILE_PX, x // TILE_PX]
+                before, after = paths[i & 1], paths[1 - (i & 1)]
+                x_before = x - 1 + 2 * backwards
+                if i > 0 and places[y, x_before] < 0:
+                    _start(own.prior[y, x_before], before)
+                    least = np.uint16(0)
+                elif i > 0 and x_before // TILE_PX != x // TILE_PX:
+                    tile = y // TILE_PX, x_before // TILE_PX
+                    _close(before, firsts[tile], counts[tile])
+                if not backwards:
+                    sums[place : place + count] = 0
+                jump = large_step[y, min(x + backwards, width - 1)]
+                end, path_end = place + count, skipped + count + 2
+                least = _step(
+                    before[skipped:path_end],
+                    least,
+                    costs[place:end],
+                    jump,
+                    after[skipped:path_end],
+                    sums[place:end],
+                )
 
 
 @inlined
@@ -260,13 +332,12 @@ def _between(before, here, after):
 def _find_least(costs):
     """Return the candidate of least cost, with a subpixel offset."""
     count = costs.shape[0]
-    lowest = costs[0]
+    # Cost and candidate in one number, so that a single loop, which can be vectorised, finds both.
+    least = _LARGEST
     for i in range(count):
-        lowest = min(lowest, costs[i])
-    i = 0
-    while costs[i] != lowest:
-        i += 1
-    return i + (_between(costs[i - 1], lowest, costs[i + 1]) if 0 < i < count - 1 else 0.0)
+        least = min(least, np.uint32((np.uint32(costs[i]) << _HALF) | np.uint32(i)))
+    i = np.int64(least & _LOW)
+    return i + (_between(costs[i - 1], costs[i], costs[i + 1]) if 0 < i < count - 1 else 0.0)
 
 
 @kernel
@@ -280,33 +351,49 @@ def pick(sums, first_px, first, last, found_px):
 
 @kernel
 @typing.no_type_check
-def along_columns(costs, own, large_step, first_px, first, last, sums, found_px):
-    """Add the paths from above and below to columns first..last of sums, at searched pixels.
+def along_columns(costs, own, search, large_step, levels, first_px, first, last, sums, found_px):
+    """Add the paths from above and below along the image's columns first..last to sums.
 
-    The disparities of least cost are written to the same columns of found_px.
+    The disparities of least cost are written to the searched pixels of found_px.
     """
-    height, _, count = costs.shape
-    width = last - first
-    paths = np.empty((2, width, count + 2), np.uint16)
+    places, firsts, counts = search
+    height, width, size = len(places), last - first, levels + 2
+    # One after the other, because Numba counts references to rows of arrays, at every pixel.
+    paths = np.empty(2 * width * size, np.uint16)
     least = np.empty(width, np.uint16)
     for backwards in range(2):
-        paths[:] = 0
-        paths[:, :, 0] = paths[:, :, count + 1] = _NEVER
+        for j in range(2 * width):
+            paths[j * size : (j + 1) * size] = 0
+            paths[j * size] = paths[(j + 1) * size - 1] = _NEVER
         least[:] = 0
         for i in range(height):
             y = height - 1 - i if backwards else i
-            jumps = large_step[min(y + backwards, height - 1)]
-            before, after = paths[i & 1], paths[1 - (i & 1)]
             y_before = y - 1 + 2 * backwards
+            y_step = min(y + backwards, height - 1)
             for j in range(width):
                 x = first + j
-                if own.searched[y, x]:
-                    if i > 0 and not own.searched[y_before, x]:
-                        _start(own.prior[y_before, x], before[j])
-                        least[j] = 0
-                    least[j] = _step(before[j], least[j], costs[y, x], jumps[x], after[j], sums[y, x])
-                    if backwards:
-                        found_px[y, x] = first_px + _find_least(sums[y, x])
+                place = places[y, x]
+                if place < 0:
+                    continue
+                skipped, count = firsts[y // TILE_PX, x // TILE_PX], counts[y // TILE_PX, x // TILE_PX]
+                before, after = ((i & 1) * width + j) * size, ((1 - (i & 1)) * width + j) * size
+                if i > 0 and places[y_before, x] < 0:
+                    _start(own.prior[y_before, x], paths[before : before + size])
+                    least[j] = 0
+                elif i > 0 and y_before // TILE_PX != y // TILE_PX:
+                    tile = y_before // TILE_PX, x // TILE_PX
+                    _close(paths[before : before + size], firsts[tile], counts[tile])
+                end, path_end = place + count, skipped + count + 2
+                least[j] = _step(
+                    paths[before + skipped : before + path_end],
+                    least[j],
+                    costs[place:end],
+                    large_step[y_step, x],
+                    paths[after + skipped : after + path_end],
+                    sums[place:end],
+                )
+                if backwards:
+                    found_px[y, x] = first_px + skipped + _find_least(sums[place:end])
 
 
 @kernel

@@ -34,18 +34,37 @@ def plain_census(grey):
     return codes
 
 
-def plain_sums(costs, own):
+def plain_candidates(prior, count):
+    """Return the mask [H, W, D] of the candidates that are searched, given priors in eighths of a pixel.
+
+    They are those of the tile of 32x32 pixels and of the tiles up to two away.
+    """
+    height, width = prior.shape
+    candidates = np.zeros((height, width, count), bool)
+    for y in range(0, height, 32):
+        for x in range(0, width, 32):
+            around = prior[max(y - 64, 0) : y + 96, max(x - 64, 0) : x + 96].astype(int)
+            first = max(around.min() // 8 - 4, 0)
+            number = around.max() // 8 + 6 - first
+            number = min(number + -number % 16, count)
+            first = min(first, count - number)
+            candidates[y : y + 32, x : x + 32, first : first + number] = True
+    return candidates
+
+
+def plain_sums(costs, own, searched):
     """Return each candidate's aggregated cost, the sum over paths from left, right, above and below.
 
-    A path that comes from a pixel that is not searched begins there, at the prior, without a cost. `own` are
-    `Cues`.
+    Candidates that are not searched have OUTSIDE or more. A path that comes from a pixel that is not
+    `searched` begins there, at the prior, without a cost. `own` are `Cues`.
     """
     total = np.zeros(costs.shape, int)
     away = abs(own.prior[..., None].astype(int) - 8 * np.arange(costs.shape[2]))
     known = np.where(away <= 8, 0, OUTSIDE)
+    closed = ~plain_candidates(own.prior, costs.shape[2])
     for axis in (0, 1):
         for backwards in (False, True):
-            volumes = (costs, own.grey.astype(int), own.searched, known, total)
+            volumes = (costs, own.grey.astype(int), searched, known, closed, total)
             lines = [np.swapaxes(values, 0, axis) for values in volumes]
             if backwards:
                 lines = [line[::-1] for line in lines]
@@ -53,9 +72,9 @@ def plain_sums(costs, own):
     return total
 
 
-def _add_path(costs, grey, searched, known, total):
+def _add_path(costs, grey, searched, known, closed, total):
     """Add the path down the first axis, all columns at once."""
-    path = costs[0].copy()
+    path = np.where(closed[0], OUTSIDE, costs[0])
     total[0] += path
     for y in range(1, len(costs)):
         path = np.where(searched[y - 1, :, None], path, known[y - 1])
@@ -68,7 +87,7 @@ def _add_path(costs, grey, searched, known, total):
             beside[:, 2:] + 20,
             np.broadcast_to(least + jump[:, None], path.shape),
         ]
-        path = costs[y] + np.min(ways, 0) - least
+        path = np.where(closed[y], OUTSIDE, costs[y] + np.min(ways, 0) - least)
         total[y] += path
 
 
@@ -81,7 +100,8 @@ def plain_pick(sums, first_px):
         np.take_along_axis(sums, inner[..., None] + step, 2)[..., 0] for step in (-1, 0, 1)
     )
     rise = np.maximum(before, after) - here
-    part = np.where((inner == best) & (rise > 0), 0.5 * (before - after) / np.maximum(rise, 1), 0)
+    between = (inner == best) & (rise > 0) & (np.maximum(before, after) < OUTSIDE)
+    part = np.where(between, 0.5 * (before - after) / np.maximum(rise, 1), 0)
     return first_px + best + part
 
 

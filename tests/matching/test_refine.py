@@ -144,19 +144,39 @@ def test_the_kernels_equal_the_plain_ones(rng):
     other = refining._cues(right, given.right_disparity_px - first_px, refining.right_confidence(given))
     for view in (own, other):
         np.testing.assert_array_equal(view.census, plain_census(view.grey))
-    costs = np.empty((24, 50, count), np.uint8)
-    kernels.match(own, refining._align(other, first_px, count, -1), -1, 0, 24, costs)
+    searched = np.ones((24, 50), bool)
+    searched[8:16, 14:36] = False  # 4 px and more inside the block
+    np.testing.assert_array_equal(refining.find_searched(given.confidence), searched)
+    search, size = refining._lay_out(*(np.full((1, 2), end, np.int32) for end in (0, count)), searched)
+    costs = np.empty(size, np.uint8)
+    kernels.match(own, refining._align(other, first_px, count, -1), search, -1, 0, 24, costs)
     expected = plain_costs(own, other, first_px, count)
-    np.testing.assert_array_equal(costs[own.searched], expected[own.searched])
+    np.testing.assert_array_equal(costs, expected[searched].ravel())
     found_px, _ = refining._match_views(
         StereoPair(left=left, right=right), given, refining.right_confidence(given), 1
     )
-    expected_px = plain_pick(plain_sums(expected, own), first_px)
-    np.testing.assert_allclose(found_px[own.searched], expected_px[own.searched], atol=1e-5)
-    np.testing.assert_allclose(found_px[~own.searched], given.disparity_px[~own.searched], atol=1 / 16)
-    searched = np.ones((24, 50), bool)
-    searched[8:16, 14:36] = False  # 4 px and more inside the block
-    np.testing.assert_array_equal(own.searched, searched)
+    expected_px = plain_pick(plain_sums(expected, own, searched), first_px)
+    np.testing.assert_allclose(found_px[searched], expected_px[searched], atol=1e-5)
+    np.testing.assert_allclose(found_px[~searched], given.disparity_px[~searched], atol=1 / 16)
+
+
+def test_each_tile_searches_the_disparities_of_the_tiles_around(rng):
+    left, right = (cv2.blur(rng.integers(0, 256, (70, 300, 3), np.uint8), (3, 3)) for _ in range(2))
+    maps_px = [np.repeat(rng.uniform(0, 9, (70, 60)), 5, 1) for _ in range(2)]
+    for view_px in maps_px:
+        view_px[:, 200:] += 50
+    pair, given = StereoPair(left=left, right=right), estimate_of(*maps_px)
+    given.confidence[:, 120:140] = 0.9
+    first_px, count = refining._candidates(given)
+    right_trust = refining.right_confidence(given)
+    own = refining._cues(left, given.disparity_px - first_px, given.confidence)
+    other = refining._cues(right, given.right_disparity_px - first_px, right_trust)
+    searched = refining.find_searched(given.confidence)
+    costs = plain_costs(own, other, first_px, count)
+    expected_px = plain_pick(plain_sums(costs, own, searched), first_px)
+    found_px, _ = refining._match_views(pair, given, right_trust, 2)
+    np.testing.assert_allclose(found_px[searched], expected_px[searched], atol=1e-5)
+    assert found_px[:, :96].max() < 30  # columns 0..95 see none of the disparities from 50 px
 
 
 def test_both_views_settle_as_the_plain_ones(rng):

@@ -16,6 +16,7 @@ LEAST_WEIGHT = np.float32(1e-6)
 """Neighbours below this weight do not vote."""
 SAME_PX = np.float32(1.0)
 """Neighbours within this of the median agree with it."""
+_FARTHEST_PX = np.float32(3e38)  # no disparity is farther from 0
 
 
 @kernel
@@ -39,7 +40,8 @@ def vote(lab, before_px, confidence, sound, voted_px, agreement, unsound, first,
         end: Row after the last.
     """
     height, width = before_px.shape
-    ballots = np.empty(((2 * RADIUS_PX + 1) ** 2, 3), np.float32)
+    # Of each neighbour that votes: disparity, weight, and weight without confidence.
+    ballots = np.empty((3, (2 * RADIUS_PX + 1) ** 2), np.float32)
     for y in range(first, end):
         for x in range(width):
             if sound[y, x]:
@@ -52,10 +54,11 @@ def vote(lab, before_px, confidence, sound, voted_px, agreement, unsound, first,
                     alike = _weigh(lab, y, x, v, u)
                     weight = alike * (confidence[v, u] + LEAST_CONFIDENCE)
                     if weight >= LEAST_WEIGHT:
-                        _insert(ballots, count, before_px[v, u], weight, alike)
+                        ballots[0, count] = before_px[v, u]
+                        ballots[1, count], ballots[2, count] = weight, alike
                         count, total = count + 1, total + weight
             if count > 0:
-                voted_px[y, x], unsound[y, x] = _find_median(ballots, total), False
+                voted_px[y, x], unsound[y, x] = _find_median(ballots, count, total), False
                 agreement[y, x] = _measure_agreement(ballots, count, voted_px[y, x])
 
 
@@ -72,28 +75,30 @@ def _weigh(lab, y, x, v, u):
 
 @inlined
 @typing.no_type_check
-def _insert(ballots, count, value, weight, alike):
-    """Insert a disparity and its weight, with and without confidence, into the first `count` ballots.
+def _find_median(ballots, count, total):
+    """Return the least disparity up to which the weights sum to half of the total.
 
-    The ballots remain in ascending order of disparity.
+    Each disparity between the known bounds becomes a bound itself, so few are compared with all others.
     """
-    at = count
-    while at > 0 and ballots[at - 1, 0] > value:
-        for column in range(3):
-            ballots[at, column] = ballots[at - 1, column]
-        at -= 1
-    ballots[at, 0], ballots[at, 1], ballots[at, 2] = value, weight, alike
+    below, median = -_FARTHEST_PX, _FARTHEST_PX
+    for i in range(count):
+        px = ballots[0, i]
+        if below < px < median:
+            if _sum_up_to(ballots, count, px) >= total / np.float32(2):
+                median = px
+            else:
+                below = px
+    return median
 
 
 @inlined
 @typing.no_type_check
-def _find_median(ballots, total):
-    """Return the first disparity at which the sum of the weights reaches half of the total."""
-    at, below = 0, ballots[0, 1]
-    while below < total / np.float32(2):
-        at += 1
-        below += ballots[at, 1]
-    return ballots[at, 0]
+def _sum_up_to(ballots, count, px):
+    """Return the sum of the weights of all disparities up to one of them."""
+    total = np.float32(0)
+    for i in range(count):
+        total += ballots[1, i] if ballots[0, i] <= px else np.float32(0)
+    return total
 
 
 @inlined
@@ -102,7 +107,7 @@ def _measure_agreement(ballots, count, median):
     """Return the share of the neighbours that agree with the median, each times its confidence."""
     agreeing, total = np.float32(0), np.float32(0)
     for i in range(count):
-        total += ballots[i, 2]
-        if abs(ballots[i, 0] - median) <= SAME_PX:
-            agreeing += ballots[i, 1] - LEAST_CONFIDENCE * ballots[i, 2]
+        total += ballots[2, i]
+        if abs(ballots[0, i] - median) <= SAME_PX:
+            agreeing += ballots[1, i] - LEAST_CONFIDENCE * ballots[2, i]
     return agreeing / total
