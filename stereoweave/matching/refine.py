@@ -1,7 +1,7 @@
 """Refinement of an estimate by matching once more at full resolution, with the network's disparity as prior.
 
 The method is semi-global matching (Hirschmueller 2008) at and around pixels of which the network is not
-certain, over all disparities between the network's least and greatest disparity nearby. A candidate's cost is
+certain, over all disparities from the network's least one nearby to its greatest one. A candidate's cost is
 the colour and census difference, plus the confidence-weighted distance to the network's disparity. Where both
 views agree, the found disparities replace the network's. This recovers edges, as well as thin structures that
 are below the network's resolution.
@@ -39,8 +39,9 @@ _HALVING_LEVELS = 30
 _REACH_PX = 4
 _AROUND = np.ones((2 * _REACH_PX + 1, 2 * _REACH_PX + 1), np.uint8)
 _BESIDE = np.ones((1, 3), np.uint8)
-# The candidates of a tile are the disparities in it and in the 24 tiles around it.
-_TILES_AROUND = np.ones((5, 5), np.uint8)
+# A tile's first candidate is the least disparity in it and in the eight tiles around it. Nearer surfaces are
+# searched everywhere, because what the network misses is nearer than what is around it.
+_TILES_AROUND = np.ones((3, 3), np.uint8)
 # Factor on a pixel's confidence where the network's disparities for the two views disagree.
 _DOUBTED = 0.2
 _SAME_PX = 1.0
@@ -114,10 +115,9 @@ def find_matching_costs(pair: StereoPair, count: int) -> UInt8[np.ndarray, "h w 
 
     nothing = np.zeros(pair.left.shape[:2], np.float32)
     own, other = (_cues(image, nothing, nothing) for image in (pair.left, pair.right))
-    tiles = _tiles(nothing.shape)
-    search, size = _lay_out(np.zeros(tiles, np.int32), np.full(tiles, count, np.int32), nothing == 0)
+    search, size = _lay_out(np.zeros(_tiles(nothing.shape), np.int32), nothing == 0, count)
     costs = np.empty(size, np.uint8)
-    kernels.match(own, _align(other, 0, count, -1), search, -1, 0, len(nothing), costs)
+    kernels.match(own, _align(other, 0, count, -1), search, -1, count, 0, len(nothing), costs)
     return costs.reshape(*nothing.shape, count)
 
 
@@ -182,7 +182,7 @@ def _match_strip(strip: _View, first_px: int, count: int, threads: int) -> Float
     found_px = first_px + own.prior / np.float32(kernels.SUBSTEPS)
 
     def match(first: int, last: int) -> None:
-        kernels.match(own, other, search, towards, first, last, costs)
+        kernels.match(own, other, search, towards, count, first, last, costs)
         kernels.along_rows(costs, own, search, steps_along, count, first, last, sums)
 
     def pick(first: int, last: int) -> None:
@@ -215,13 +215,11 @@ def _search(view: _View, count: int) -> tuple["Search", int]:
     """Choose each tile's candidates among `count` ones; also return their number, summed over all pixels."""
     from stereoweave.matching import refine_kernels as kernels
 
-    least, most = np.empty((2, *_tiles(view.searched.shape)), np.uint16)
-    kernels.find_ends(view.own.prior, least, most)
-    least, most = cv2.erode(least, _TILES_AROUND), cv2.dilate(most, _TILES_AROUND)
-    firsts = np.maximum(least.astype(np.int32) // kernels.SUBSTEPS - _MARGIN_PX, 0)
-    counts = most.astype(np.int32) // kernels.SUBSTEPS + _MARGIN_PX + 2 - firsts
-    counts = np.minimum(counts + -counts % _CANDIDATES_MULTIPLE, count)
-    return _lay_out(np.minimum(firsts, count - counts), counts, view.searched)
+    least = np.empty(_tiles(view.searched.shape), np.uint16)
+    kernels.find_least(view.own.prior, least)
+    firsts = cv2.erode(least, _TILES_AROUND).astype(np.int32) // kernels.SUBSTEPS - _MARGIN_PX
+    firsts = np.maximum(firsts, 0)
+    return _lay_out(firsts - firsts % _CANDIDATES_MULTIPLE, view.searched, count)
 
 
 def _tiles(size: tuple[int, ...]) -> tuple[int, ...]:
@@ -232,14 +230,14 @@ def _tiles(size: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def _lay_out(
-    firsts: Int32[np.ndarray, "h w"], counts: Int32[np.ndarray, "h w"], searched: Bool[np.ndarray, "h2 w2"]
+    firsts: Int32[np.ndarray, "h w"], searched: Bool[np.ndarray, "h2 w2"], count: int
 ) -> tuple["Search", int]:
     """Place the candidates of the searched pixels one after the other; also return their total number."""
     from stereoweave.matching import refine_kernels as kernels
 
-    search = kernels.Search(np.empty(searched.shape, np.int64), firsts, counts)
+    search = kernels.Search(np.empty(searched.shape, np.int64), firsts)
     total = np.empty(1, np.int64)
-    kernels.lay_out(searched, search, total)
+    kernels.lay_out(searched, count, search, total)
     return search, int(total[0])
 
 

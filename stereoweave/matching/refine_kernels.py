@@ -66,18 +66,16 @@ class Cues(typing.NamedTuple):
 
 
 class Search(typing.NamedTuple):
-    """The candidates that are searched; C-contiguous arrays.
+    """The candidates that are searched: those of each pixel from its tile's first one on.
 
     Attributes:
         places: int64 [H, W], start of each pixel's candidates in the volumes; -1 where the network's
             disparity is certain.
         firsts: int32, first candidate of each tile.
-        counts: int32, number of candidates of each tile.
     """
 
     places: np.ndarray
     firsts: np.ndarray
-    counts: np.ndarray
 
 
 @kernel
@@ -183,19 +181,19 @@ def _add_pulls(prior, trust, priors, trusts, first, costs):
 
 @kernel
 @typing.no_type_check
-def find_ends(prior, least, most):
-    """Write the least and the greatest prior of each tile."""
+def find_least(prior, least):
+    """Write the least prior of each tile."""
     height, width = prior.shape
-    least[:], most[:] = _HIGHEST, 0
+    least[:] = _HIGHEST
     for y in range(height):
         for x in range(width):
             tile = y // TILE_PX, x // TILE_PX
-            least[tile], most[tile] = min(least[tile], prior[y, x]), max(most[tile], prior[y, x])
+            least[tile] = min(least[tile], prior[y, x])
 
 
 @kernel
 @typing.no_type_check
-def lay_out(searched, search, total):
+def lay_out(searched, levels, search, total):
     """Write the places of the `searched` pixels' candidates, one pixel after the other, and their number."""
     height, width = searched.shape
     place = 0
@@ -203,25 +201,27 @@ def lay_out(searched, search, total):
         for x in range(width):
             search.places[y, x] = place if searched[y, x] else -1
             if searched[y, x]:
-                place += search.counts[y // TILE_PX, x // TILE_PX]
+                place += levels - search.firsts[y // TILE_PX, x // TILE_PX]
     total[0] = place
 
 
 @kernel
 @typing.no_type_check
-def match(own, other, search, towards, first, last, costs):
+def match(own, other, search, towards, levels, first, last, costs):
     """Write the matching costs (uint8) of the searched pixels of the image's rows first..last.
 
-    towards is -1 for a left view, whose matches are to the left, and 1 for a right view.
+    towards is -1 for a left view, whose matches are to the left, and 1 for a right view. levels is the number
+    of all candidates.
     """
-    places, firsts, counts = search
+    places, firsts = search
     width = places.shape[1]
     for y in range(first, last):
         for x in range(width):
             place = places[y, x]
             if place < 0:
                 continue
-            skipped, count = firsts[y // TILE_PX, x // TILE_PX], counts[y // TILE_PX, x // TILE_PX]
+            skipped = firsts[y // TILE_PX, x // TILE_PX]
+            count = levels - skipped
             start = skipped + (x if towards > 0 else width - 1 - x)
             end = start + count
             out = costs[place : place + count]
@@ -251,11 +251,9 @@ def _start(prior, path):
 
 @inlined
 @typing.no_type_check
-def _close(path, first, count):
-    """Write _NEVER to a path's costs of all candidates but `count` ones from `first`."""
+def _close(path, first):
+    """Write _NEVER to a path's costs of the candidates before `first`."""
     for i in range(first + 1):
-        path[i] = _NEVER
-    for i in range(first + count + 1, path.shape[0]):
         path[i] = _NEVER
 
 
@@ -265,7 +263,7 @@ def _step(before, least, costs, large_step, after, sums):
     """Advance a path by one pixel: write its costs into after, add them to sums and return the least cost."""
     limit = np.uint16(least + large_step)
     lowest = _NEVER
-    after[0] = after[costs.shape[0] + 1] = _NEVER
+    after[0] = _NEVER
     for i in range(costs.shape[0]):
         beside = np.uint16(min(before[i], before[i + 2]) + np.uint16(SMALL_STEP))
         cost = np.uint16(min(min(before[i + 1], beside), limit) - least + np.uint16(costs[i]))
@@ -283,7 +281,7 @@ def along_rows(costs, own, search, large_step, levels, first, last, sums):
     large_step [H, W] is the penalty for a large step from the previous pixel to each pixel. levels is the
     number of all candidates.
     """
-    places, firsts, counts = search
+    places, firsts = search
     width = places.shape[1]
     paths = np.empty((2, levels + 2), np.uint16)
     for y in range(first, last):
@@ -296,25 +294,24 @@ def along_rows(costs, own, search, large_step, levels, first, last, sums):
                 place = places[y, x]
                 if place < 0:
                     continue
-                skipped, count = firsts[y // TILE_PX, x // TILE_PX], counts[y // TILE_PX, x // TILE_PX]
+                skipped = firsts[y // TILE_PX, x // TILE_PX]
                 before, after = paths[i & 1], paths[1 - (i & 1)]
                 x_before = x - 1 + 2 * backwards
                 if i > 0 and places[y, x_before] < 0:
                     _start(own.prior[y, x_before], before)
                     least = np.uint16(0)
                 elif i > 0 and x_before // TILE_PX != x // TILE_PX:
-                    tile = y // TILE_PX, x_before // TILE_PX
-                    _close(before, firsts[tile], counts[tile])
+                    _close(before, firsts[y // TILE_PX, x_before // TILE_PX])
+                end = place + levels - skipped
                 if not backwards:
-                    sums[place : place + count] = 0
+                    sums[place:end] = 0
                 jump = large_step[y, min(x + backwards, width - 1)]
-                end, path_end = place + count, skipped + count + 2
                 least = _step(
-                    before[skipped:path_end],
+                    before[skipped:],
                     least,
                     costs[place:end],
                     jump,
-                    after[skipped:path_end],
+                    after[skipped:],
                     sums[place:end],
                 )
 
@@ -356,7 +353,7 @@ def along_columns(costs, own, search, large_step, levels, first_px, first, last,
 
     The disparities of least cost are written to the searched pixels of found_px.
     """
-    places, firsts, counts = search
+    places, firsts = search
     height, width, size = len(places), last - first, levels + 2
     # One after the other, because Numba counts references to rows of arrays, at every pixel.
     paths = np.empty(2 * width * size, np.uint16)
@@ -375,21 +372,20 @@ def along_columns(costs, own, search, large_step, levels, first_px, first, last,
                 place = places[y, x]
                 if place < 0:
                     continue
-                skipped, count = firsts[y // TILE_PX, x // TILE_PX], counts[y // TILE_PX, x // TILE_PX]
+                skipped = firsts[y // TILE_PX, x // TILE_PX]
                 before, after = ((i & 1) * width + j) * size, ((1 - (i & 1)) * width + j) * size
                 if i > 0 and places[y_before, x] < 0:
                     _start(own.prior[y_before, x], paths[before : before + size])
                     least[j] = 0
                 elif i > 0 and y_before // TILE_PX != y // TILE_PX:
-                    tile = y_before // TILE_PX, x // TILE_PX
-                    _close(paths[before : before + size], firsts[tile], counts[tile])
-                end, path_end = place + count, skipped + count + 2
+                    _close(paths[before : before + size], firsts[y_before // TILE_PX, x // TILE_PX])
+                end = place + levels - skipped
                 least[j] = _step(
-                    paths[before + skipped : before + path_end],
+                    paths[before + skipped : before + size],
                     least[j],
                     costs[place:end],
                     large_step[y_step, x],
-                    paths[after + skipped : after + path_end],
+                    paths[after + skipped : after + size],
                     sums[place:end],
                 )
                 if backwards:

@@ -37,18 +37,15 @@ def plain_census(grey):
 def plain_candidates(prior, count):
     """Return the mask [H, W, D] of the candidates that are searched, given priors in eighths of a pixel.
 
-    They are those of the tile of 32x32 pixels and of the tiles up to two away.
+    They begin at the least disparity of the tile of 32x32 pixels and of the eight around it.
     """
     height, width = prior.shape
     candidates = np.zeros((height, width, count), bool)
     for y in range(0, height, 32):
         for x in range(0, width, 32):
-            around = prior[max(y - 64, 0) : y + 96, max(x - 64, 0) : x + 96].astype(int)
-            first = max(around.min() // 8 - 4, 0)
-            number = around.max() // 8 + 6 - first
-            number = min(number + -number % 16, count)
-            first = min(first, count - number)
-            candidates[y : y + 32, x : x + 32, first : first + number] = True
+            around = prior[max(y - 32, 0) : y + 64, max(x - 32, 0) : x + 64].astype(int)
+            first = max(around.min() // 8 - 4, 0) // 16 * 16
+            candidates[y : y + 32, x : x + 32, first:] = True
     return candidates
 
 
