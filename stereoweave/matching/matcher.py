@@ -103,8 +103,8 @@ class Matcher:
         self.magnification = mode.magnification if mode else 1.0
         self.refines = mode is not None
         self.votes = mode is not None and mode.voted
-        self._network = Network(self._path, provider, thread_count(threads))
         try:
+            self._network = Network(self._path, provider, thread_count(threads))
             self._outputs = self._read_outputs()
             self.name, self.multiple_of, self.max_disparity_px = self._read_properties()
             # Free dimensions have names instead of numbers, and a file may omit the shape altogether.
