@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 from stereoweave.arguments import check_kind
@@ -198,7 +197,7 @@ def _create_session(
     provider: str,
     threads: int,
     graph: bytes | None = None,
-    sizes: Mapping[str, int] = MappingProxyType({}),
+    sizes: Mapping[str, int] | None = None,
 ) -> Any:
     import onnxruntime
 
@@ -208,7 +207,7 @@ def _create_session(
     # By default, the threads keep spinning after a run and slow down other work on the same cores.
     options.add_session_config_entry("session.force_spinning_stop", "1")
     options.log_severity_level = 4  # the error below reports problems with the file
-    for name, size in sizes.items():
+    for name, size in (sizes or {}).items():
         options.add_free_dimension_override_by_name(name, size)
     if provider != CPU:
         options.add_session_config_entry("session.record_ep_graph_assignment_info", "1")
@@ -220,7 +219,7 @@ def _create_session(
     try:
         # Do not fall back to the CPU if the provider fails.
         return onnxruntime.InferenceSession(
-            graph or str(path), options, providers=providers, enable_fallback=0
+            str(path) if graph is None else graph, options, providers=providers, enable_fallback=0
         )
     except Exception as error:  # no common base class, as above
         raise _file_error(path, error) from error

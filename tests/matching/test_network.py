@@ -91,13 +91,14 @@ def test_sides_that_must_be_equal_by_their_names_keep_the_session_for_any_size(t
     assert opened == []
 
 
-def test_threads_that_match_different_sizes_at_once_all_get_their_own_maps(tmp_path):
+def test_threads_that_match_different_sizes_at_once_all_get_their_own_maps(tmp_path, opened):
     network = red_network(tmp_path)
-    pairs = [pair_of(8, 8 + i // 12 % 2) for i in range(120)]
+    pairs = [pair_of(8, 8 + i // 30 % 2) for i in range(120)]
     with ThreadPoolExecutor(4) as pool:
         found = list(pool.map(lambda pair: network.run(["disparity_px"], pair, False)[0], pairs))
     for pair, disparity_px in zip(pairs, found, strict=True):
         np.testing.assert_allclose(disparity_px, red(pair), rtol=1e-6)
+    assert opened
 
 
 def test_its_own_session_has_the_same_number_of_threads(tmp_path, monkeypatch):
@@ -118,3 +119,23 @@ def test_a_run_that_fails_names_the_file(tmp_path):
     network = red_network(tmp_path)
     with pytest.raises(MatcherError, match=r"red\.onnx"):
         network.run(["disparity_px"], {"left": np.zeros((1, 3, 8, 8), np.float64)}, False)
+
+
+def test_a_size_that_cannot_be_planned_keeps_the_session_for_any_size(tmp_path, monkeypatch):
+    def refuse(*_):
+        raise MatcherError("no such plan")
+
+    monkeypatch.setattr(networks, "open_session_of_size", refuse)
+    network, pair = red_network(tmp_path), pair_of(8, 8)
+    for _ in range(RUNS_BEFORE + 2):
+        np.testing.assert_allclose(network.run(["disparity_px"], pair, False)[0], red(pair), rtol=1e-6)
+
+
+def test_no_size_is_planned_on_a_gpu(tmp_path, opened, monkeypatch):
+    open_session = networks.open_session
+    monkeypatch.setattr(networks, "open_session", lambda path, _, threads: open_session(path, "cpu", threads))
+    nodes = red_of("left", "disparity_px")
+    network = Network(matcher_file(tmp_path / "red.onnx", nodes, ["disparity_px"]), "cuda", 1)
+    for _ in range(RUNS_BEFORE + 2):
+        network.run(["disparity_px"], pair_of(8, 8), False)
+    assert opened == []
