@@ -30,7 +30,7 @@ _CANDIDATES_MULTIPLE = 16
 # Each candidate of a searched pixel takes 3 bytes, so larger images are refined in strips, which overlap by
 # this many rows on each side.
 _CANDIDATES_AT_ONCE = 100_000_000
-_OVERLAP_PX = 24
+_OVERLAP_PX = 64  # two tiles
 # Penalty for a large disparity step: greatest between equal grey levels, halved at this grey difference.
 _LARGEST_STEP, _LEAST_LARGE_STEP = 125, 30
 _HALVING_LEVELS = 30
@@ -176,7 +176,7 @@ def _match_strip(strip: _View, first_px: int, count: int, threads: int) -> Float
 
     own, other, _, towards = strip
     height, width = own.grey.shape
-    search, size = _search(strip, count)
+    search, size = _choose_candidates(strip, count)
     costs, sums = np.empty(size, np.uint8), np.empty(size, np.uint16)
     steps_along, steps_down = (_large_steps(own.grey, axis) for axis in (1, 0))
     found_px = first_px + own.prior / np.float32(kernels.SUBSTEPS)
@@ -211,12 +211,12 @@ def find_searched(trust: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     return cv2.dilate((trust < kernels.CERTAIN).astype(np.uint8), _AROUND) > 0
 
 
-def _search(view: _View, count: int) -> tuple["Search", int]:
+def _choose_candidates(view: _View, count: int) -> tuple["Search", int]:
     """Choose each tile's candidates among `count` ones; also return their number, summed over all pixels."""
     from stereoweave.matching import refine_kernels as kernels
 
     least = np.empty(_tiles(view.searched.shape), np.uint16)
-    kernels.find_least(view.own.prior, least)
+    kernels.find_least_priors(view.own.prior, least)
     firsts = cv2.erode(least, _TILES_AROUND).astype(np.int32) // kernels.SUBSTEPS - _MARGIN_PX
     firsts = np.maximum(firsts, 0)
     return _lay_out(firsts - firsts % _CANDIDATES_MULTIPLE, view.searched, count)

@@ -181,7 +181,7 @@ def _add_pulls(prior, trust, priors, trusts, first, costs):
 
 @kernel
 @typing.no_type_check
-def find_least(prior, least):
+def find_least_priors(prior, least):
     """Write the least prior of each tile."""
     height, width = prior.shape
     least[:] = _HIGHEST
@@ -327,7 +327,7 @@ def _between(before, here, after):
 @inlined
 @typing.no_type_check
 def _find_least(costs):
-    """Return the candidate of least cost, with a subpixel offset."""
+    """Return the candidate of least cost (uint16), with a subpixel offset."""
     count = costs.shape[0]
     # Cost and candidate in one number, so that a single loop, which can be vectorised, finds both.
     least = _LARGEST
@@ -355,7 +355,7 @@ def along_columns(costs, own, search, large_step, levels, first_px, first, last,
     """
     places, firsts = search
     height, width, size = len(places), last - first, levels + 2
-    # One after the other, because Numba counts references to rows of arrays, at every pixel.
+    # All paths are in one flat array, because Numba would count references to its rows, at every pixel.
     paths = np.empty(2 * width * size, np.uint16)
     least = np.empty(width, np.uint16)
     for backwards in range(2):

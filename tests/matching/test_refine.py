@@ -160,11 +160,12 @@ def test_the_kernels_equal_the_plain_ones(rng):
     np.testing.assert_allclose(found_px[~searched], given.disparity_px[~searched], atol=1 / 16)
 
 
-def test_each_tile_searches_from_the_least_disparity_of_the_tiles_around(rng):
-    left, right = (cv2.blur(rng.integers(0, 256, (70, 300, 3), np.uint8), (3, 3)) for _ in range(2))
-    maps_px = [np.repeat(rng.uniform(0, 9, (70, 60)), 5, 1) for _ in range(2)]
+@pytest.mark.parametrize("moved_px", [0, -20])
+def test_each_tile_searches_from_the_least_disparity_of_the_tiles_around(rng, moved_px):
+    left, right = (cv2.blur(rng.integers(0, 256, (140, 300, 3), np.uint8), (3, 3)) for _ in range(2))
+    maps_px = [np.repeat(rng.uniform(0, 9, (140, 60)), 5, 1) + moved_px for _ in range(2)]
     for view_px in maps_px:
-        view_px[:, 200:] += 50
+        view_px[64:, 200:] += 50
     pair, given = StereoPair(left=left, right=right), estimate_of(*maps_px)
     given.confidence[:, 120:140] = 0.9
     first_px, count = refining._candidates(given)
@@ -176,7 +177,8 @@ def test_each_tile_searches_from_the_least_disparity_of_the_tiles_around(rng):
     expected_px = plain_pick(plain_sums(costs, own, searched), first_px)
     found_px, _ = refining._match_views(pair, given, right_trust, 2)
     np.testing.assert_allclose(found_px[searched], expected_px[searched], atol=1e-5)
-    assert found_px[:, 256:].min() > 30  # neither tile here, nor any beside it, has a disparity below 50 px
+    # The last tile row sees no disparity below 50 px, neither in its own tiles nor in those around.
+    assert found_px[128:, 256:].min() > 30 + moved_px
 
 
 def test_both_views_settle_as_the_plain_ones(rng):
