@@ -115,6 +115,28 @@ def test_its_own_session_has_the_same_number_of_threads(tmp_path, monkeypatch):
     assert used[0] is not used[-1]
 
 
+def releases_memory(options):
+    try:
+        return options.get_run_config_entry("memory.enable_memory_arena_shrinkage") == "cpu:0"
+    except RuntimeError:  # there is no such entry
+        return False
+
+
+def test_the_session_for_any_size_releases_its_memory_before_another_replaces_it(tmp_path, monkeypatch):
+    network, released = red_network(tmp_path), []
+    run = onnxruntime.InferenceSession.run
+
+    def spy(self, outputs, inputs, options):
+        released.append(releases_memory(options))
+        return run(self, outputs, inputs, options)
+
+    monkeypatch.setattr(onnxruntime.InferenceSession, "run", spy)
+    for _ in range(RUNS_BEFORE + 2):
+        network.run(["disparity_px"], pair_of(8, 8), False)
+    network.run(["disparity_px"], pair_of(8, 9), True)
+    assert released == [*(RUNS_BEFORE - 1) * [False], True, False, False, True]
+
+
 def test_a_run_that_fails_names_the_file(tmp_path):
     network = red_network(tmp_path)
     with pytest.raises(MatcherError, match=r"red\.onnx"):
