@@ -217,11 +217,14 @@ def count_multiply_adds(network: nn.Module, height: int = 480, width: int = 640)
     counted = counter.get_total_flops() // 2
     if not isinstance(network, WeaveNet):
         return counted
-    pixels = 2 * height * width  # of both views
-    # The last refinement is at 1/2 resolution, and each one before it at half that of the next.
-    scales = (4**i for i in range(len(network.refinements), 0, -1))
-    matches = (one.products * pixels // scale for one, scale in zip(network.refinements, scales, strict=True))
-    return counted + sum(matches)
+    *of_both, last = network.refinements
+    # The last refinement is of the left view alone, at 1/2 resolution. Each one before it is of both views,
+    # at half the resolution of its successor.
+    counted += last.products * height * width // 4
+    scales = (4**i for i in range(len(of_both) + 1, 1, -1))
+    return counted + sum(
+        2 * one.products * height * width // scale for one, scale in zip(of_both, scales, strict=True)
+    )
 
 
 def _make_card(kept: Checkpoint, network: nn.Module) -> dict[str, Any]:

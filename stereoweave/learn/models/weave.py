@@ -139,6 +139,31 @@ class WeaveStages:
     upsampling_logits: tuple[Tensor, ...]
 
 
+@dataclass(frozen=True, kw_only=True)
+class CoarseStages:
+    """Results of the stages before the last refinement, which are its inputs.
+
+    The batch holds the left views first, then the right views: mirrored, but for `context` and `match`.
+
+    Attributes:
+        correlation: As in `WeaveStages`.
+        scores: As in `WeaveStages`.
+        disparity: Disparity in half-resolution pixels [2B, 1, H/2, W/2].
+        context: The encoder's maps [2B, C, H/2, W/2].
+        match: Features to correlate [2B, C, H/2, W/2].
+        handed: Maps that the refinement gets from the stages before it [2B, C, H/2, W/2].
+        upsampling_logits: Logits of the weights of each upsampling so far.
+    """
+
+    correlation: Float[Tensor, "b d h_d w_d"]
+    scores: Float[Tensor, "b d h_d w_d"]
+    disparity: Float[Tensor, "b 1 h2 w2"]
+    context: Float[Tensor, "b c1 h2 w2"]
+    match: Float[Tensor, "b c2 h2 w2"]
+    handed: Float[Tensor, "b c3 h2 w2"]
+    upsampling_logits: tuple[Tensor, ...]
+
+
 class WeaveFeatures(NamedTuple):
     """Feature maps of an image at 1/2, 1/4, 1/8 and 1/16 of its resolution."""
 
@@ -312,9 +337,9 @@ class WeaveNet(nn.Module):
 
     Size, and cost for both views at 640x480:
 
-    - SMALL: 278,029 parameters and 2.96 G multiply-adds
-    - BASE: 1,274,290 parameters and 13.41 G multiply-adds
-    - BASE_GROWN: 1,466,405 parameters and 14.02 G multiply-adds
+    - SMALL: 278,029 parameters and 2.71 G multiply-adds
+    - BASE: 1,274,290 parameters and 12.25 G multiply-adds
+    - BASE_GROWN: 1,466,405 parameters and 12.86 G multiply-adds
     """
 
     def __init__(self, size: WeaveSize = SMALL, levels: int = 48) -> None:
@@ -343,31 +368,44 @@ class WeaveNet(nn.Module):
 
     def stages(self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]) -> WeaveStages:
         """Return the results of every stage for both views."""
+        coarse = self.estimate_coarse(left, right)
+        disparity_px, confidence_logit, logits = self.refine_both(coarse, self.refinements[-1])
+        return WeaveStages(
+            correlation=coarse.correlation,
+            scores=coarse.scores,
+            coarse_px=coarse.disparity * 2,
+            disparity_px=disparity_px,
+            confidence_logit=confidence_logit,
+            upsampling_logits=(*coarse.upsampling_logits, logits),
+        )
+
+    def estimate_coarse(self, left: Tensor, right: Tensor) -> CoarseStages:
+        """Return the results of both views before the last refinement."""
         # Here and below, len() and chunk() are avoided, because they would fix the batch size on export.
         batch = left.shape[0]
-        images = torch.cat([left, right])
-        maps = self.encoder(images)
+        maps = self.encoder(torch.cat([left, right]))
         # A mirrored right view is a left view, so one aggregation serves both.
         first = WeaveFeatures(*(as_left_view(map_, batch) for map_ in maps))
         correlation, scores, decoded = self.match(maps, first)
         quarter = self.read_disparity(scores.float(), decoded)
         spread, decoded = self._propagate(quarter, first.quarter, decoded, batch)
-        coarse_logits = self.weights(decoded).float()
-        coarse = self.upsample(spread * 2, coarse_logits)
-        fine, fine_logits, confidence = self.refinement(
-            coarse,
-            *as_matched_pixels(self.to_match_half(maps.half), batch),
-            first.half,
-            F.pixel_shuffle(self.to_half(decoded), 2),
-        )
-        return WeaveStages(
+        logits = self.weights(decoded).float()
+        return CoarseStages(
             correlation=correlation,
             scores=scores,
-            coarse_px=coarse * 2,
-            disparity_px=self.upsample(fine * 2, fine_logits.float()),
-            confidence_logit=confidence.float(),
-            upsampling_logits=(coarse_logits, fine_logits.float()),
+            disparity=self.upsample(spread * 2, logits),
+            context=maps.half,
+            match=self.to_match_half(maps.half),
+            handed=F.pixel_shuffle(self.to_half(decoded), 2),
+            upsampling_logits=(logits,),
         )
+
+    def refine_both(self, coarse: CoarseStages, refinement: Refinement) -> tuple[Tensor, Tensor, Tensor]:
+        """Return both views' disparities in pixels, their confidence logits, and the upsampling's logits."""
+        batch = coarse.match.shape[0] // 2
+        context, match = as_left_view(coarse.context, batch), as_matched_pixels(coarse.match, batch)
+        fine, logits, confidence = refinement(coarse.disparity, *match, context, coarse.handed)
+        return self.upsample(fine * 2, logits.float()), confidence.float(), logits.float()
 
     def match(self, maps: WeaveFeatures, first: WeaveFeatures) -> tuple[Tensor, Tensor, Tensor]:
         """Return the matching scores before and after aggregation, and the decoder's features.
@@ -401,8 +439,21 @@ class WeaveNet(nn.Module):
         return self.propagation(quarter, features, decoded)
 
     def forward(self, left: Tensor, right: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return both views' disparities and the left view's confidence logit, each [B, 1, H, W]."""
-        stages, batch = self.stages(left, right), left.shape[0]
+        """Return both views' disparities and the left view's confidence logit, each [B, 1, H, W].
+
+        The right view's disparity lacks the last refinement, which is a tenth of the time: it serves to check
+        the left one's.
+        """
+        coarse, batch = self.estimate_coarse(left, right), left.shape[0]
+        match = coarse.match.permute(0, 2, 3, 1)
+        fine, logits, confidence = self.refinements[-1](
+            coarse.disparity[:batch],
+            match[:batch],
+            match[batch:],
+            coarse.context[:batch],
+            coarse.handed[:batch],
+        )
+        left_px = self.upsample(fine * 2, logits.float())
+        right_px = mirror(F.interpolate(coarse.disparity[batch:] * 2, scale_factor=2.0))
         # Noise at infinity has both signs, but parallel cameras have no negative disparities.
-        disparity_px = stages.disparity_px.clamp(min=0)
-        return disparity_px[:batch], mirror(disparity_px[batch:]), stages.confidence_logit[:batch]
+        return left_px.clamp(min=0), right_px.clamp(min=0), confidence.float()

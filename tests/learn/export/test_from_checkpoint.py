@@ -218,6 +218,6 @@ def test_multiply_adds_count_the_refinement_of_weavenet():
     network, image = untrained("weave_base"), torch.rand(1, 3, 16, 32)
     with FlopCounterMode(display=False) as counter, torch.no_grad():
         network(image, image)
-    # At half the resolution, both views compare 16 features with those of 6 columns.
-    refinement = 2 * 8 * 16 * 16 * 6
+    # At half the resolution, the left view compares 16 features with those of 6 columns.
+    refinement = 8 * 16 * 16 * 6
     assert export.count_multiply_adds(network, 16, 32) == counter.get_total_flops() // 2 + refinement

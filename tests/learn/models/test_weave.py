@@ -67,21 +67,25 @@ def test_a_mirrored_pair_gives_mirrored_results():
             if isinstance(layer, nn.Conv2d):
                 layer.weight += mirror(layer.weight.clone())
         left, right = (image.double() for image in random_pair(1, 48, 80))
-        left_px, right_px, _ = network(left, right)
-        mirrored_left_px, mirrored_right_px, _ = network(mirror(right), mirror(left))
-    torch.testing.assert_close(right_px, mirror(mirrored_left_px), atol=1e-3, rtol=0)
-    torch.testing.assert_close(left_px, mirror(mirrored_right_px), atol=1e-3, rtol=0)
+        left_px, right_px = network.stages(left, right).disparity_px
+        mirrored_right_px, mirrored_left_px = network.stages(mirror(right), mirror(left)).disparity_px
+    # The stages of a right view are mirrored.
+    torch.testing.assert_close(left_px, mirrored_left_px, atol=1e-3, rtol=0)
+    torch.testing.assert_close(right_px, mirrored_right_px, atol=1e-3, rtol=0)
     assert (left_px - right_px).abs().max() > 0.1
 
 
-def test_the_stages_hold_the_left_views_and_the_mirrored_right_views():
+def test_the_left_view_is_refined_as_in_the_stages_and_the_right_one_is_their_coarse_disparity():
     network = untrained()
     pair = random_pair(2, 32, 64)
     with torch.no_grad():
         stages = network.stages(*pair)
         left_px, right_px, logit = network(*pair)
-    torch.testing.assert_close(stages.disparity_px.clamp(min=0), torch.cat([left_px, mirror(right_px)]))
-    torch.testing.assert_close(stages.confidence_logit[:2], logit)
+    torch.testing.assert_close(left_px, stages.disparity_px[:2].clamp(min=0))
+    torch.testing.assert_close(logit, stages.confidence_logit[:2])
+    # The stages of a right view are mirrored. Each of its pixels at half the resolution becomes 2x2.
+    coarse_px = mirror(stages.coarse_px[2:]).clamp(min=0)
+    assert torch.equal(right_px, coarse_px.repeat_interleave(2, 2).repeat_interleave(2, 3))
     assert stages.correlation.shape == stages.scores.shape == (4, network.levels, 8, 16)
     assert stages.coarse_px.shape == (4, 1, 16, 32)
 
@@ -146,10 +150,11 @@ def test_a_mirrored_pair_is_completed_alike():
             if isinstance(layer, nn.Conv2d):
                 layer.weight += mirror(layer.weight.clone())
         left, right = (image.double() for image in random_pair(1, 64, 96))
-        left_px, right_px, _ = network(left, right)
-        mirrored_left_px, mirrored_right_px, _ = network(mirror(right), mirror(left))
-    torch.testing.assert_close(right_px, mirror(mirrored_left_px), atol=1e-3, rtol=0)
-    torch.testing.assert_close(left_px, mirror(mirrored_right_px), atol=1e-3, rtol=0)
+        left_px, right_px = network.stages(left, right).disparity_px
+        mirrored_right_px, mirrored_left_px = network.stages(mirror(right), mirror(left)).disparity_px
+    # The stages of a right view are mirrored.
+    torch.testing.assert_close(left_px, mirrored_left_px, atol=1e-3, rtol=0)
+    torch.testing.assert_close(right_px, mirrored_right_px, atol=1e-3, rtol=0)
 
 
 def test_a_completion_takes_the_surface_that_its_affinities_point_to():

@@ -68,11 +68,24 @@ def test_the_right_view_is_the_left_view_of_the_mirrored_pair():
                 if isinstance(layer, torch.nn.Conv2d):
                     layer.weight += mirror(layer.weight.clone())
         left, right = (image.double() for image in random_pair(1, 64, 96))
-        left_px, right_px, _ = network(left, right)
-        mirrored_left_px, mirrored_right_px, _ = network(mirror(right), mirror(left))
-    torch.testing.assert_close(right_px, mirror(mirrored_left_px), atol=1e-3, rtol=0)
-    torch.testing.assert_close(left_px, mirror(mirrored_right_px), atol=1e-3, rtol=0)
+        left_px, right_px = network.stages(left, right).disparity_px
+        mirrored_right_px, mirrored_left_px = network.stages(mirror(right), mirror(left)).disparity_px
+    # The stages of a right view are mirrored.
+    torch.testing.assert_close(left_px, mirrored_left_px, atol=1e-3, rtol=0)
+    torch.testing.assert_close(right_px, mirrored_right_px, atol=1e-3, rtol=0)
     assert (left_px - right_px).abs().max() > 0.1
+
+
+def test_the_right_view_is_that_of_the_halved_images_at_twice_their_size():
+    network = untrained("weave_half")
+    pair = random_pair(2, 64, 96)
+    with torch.no_grad():
+        stages = network.stages(*pair)
+        left_px, right_px, logit = network(*pair)
+    torch.testing.assert_close(left_px, stages.disparity_px[:2].clamp(min=0))
+    torch.testing.assert_close(logit, stages.confidence_logit[:2])
+    coarse_px = mirror(stages.coarse_px[2:]).clamp(min=0)
+    assert torch.equal(right_px, coarse_px.repeat_interleave(2, 2).repeat_interleave(2, 3))
 
 
 def test_the_range_ends_at_256_px_or_with_the_levels():
