@@ -74,6 +74,24 @@ def test_certain_disparities_of_the_network_are_kept(scene):
     np.testing.assert_array_equal(refine(left, right, given).disparity_px, given.disparity_px)
 
 
+def test_a_stick_is_found_in_the_right_view_where_its_network_is_certain_of_the_wall(rng):
+    far_px, stick_px = 6, 26
+    right_px = np.full((64, 160), far_px)
+    right_px[:, STICK] = stick_px
+    left, right, _ = photographs(rng, right_px, right_px.shape)
+    confidence = np.full(right_px.shape, 0.95, np.float32)
+    in_left = slice(STICK.start + stick_px, STICK.stop + stick_px)
+    confidence[:, in_left] = 0.2
+    wall_px = np.full(right_px.shape, far_px)
+    wall_px[:10, 120:140] = stick_px  # so that the range holds both
+    given = Estimate(**vars(estimate_of(wall_px, wall_px)) | {"confidence": confidence})
+    # What the right view's network is not certain of is more than 4 px from the stick.
+    assert in_left.start - far_px - STICK.stop > 4
+    refined = refine(left, right, given)
+    assert (abs(refined.right_disparity_px[:, STICK] - stick_px) < 1).mean() > 0.95
+    assert (abs(refined.disparity_px[:, in_left] - stick_px) < 1).mean() > 0.95
+
+
 def test_correct_disparities_do_not_change_by_a_bit(scene):
     left, right, left_px, right_px = scene
     given = estimate_of(np.where(np.isnan(left_px), FAR_PX, left_px) + 0.3, right_px + 0.3, confidence=0.8)
@@ -141,7 +159,8 @@ def test_the_kernels_equal_the_plain_ones(rng):
     left, right, given = random_pair(rng)
     first_px, count = refining._candidates(given)
     own = refining._cues(left, given.disparity_px - first_px, given.confidence)
-    other = refining._cues(right, given.right_disparity_px - first_px, refining.right_confidence(given))
+    right_trust = refining.right_confidence(given)
+    other = refining._cues(right, given.right_disparity_px - first_px, np.float32(0.7) * right_trust)
     for view in (own, other):
         np.testing.assert_array_equal(view.census, plain_census(view.grey))
     searched = np.ones((24, 50), bool)
@@ -152,9 +171,7 @@ def test_the_kernels_equal_the_plain_ones(rng):
     kernels.match(own, refining._align(other, first_px, count, -1), search, -1, count, 0, 24, costs)
     expected = plain_costs(own, other, first_px, count)
     np.testing.assert_array_equal(costs, expected[searched].ravel())
-    found_px, _ = refining._match_views(
-        StereoPair(left=left, right=right), given, refining.right_confidence(given), 1
-    )
+    found_px, _ = refining._match_views(StereoPair(left=left, right=right), given, right_trust, 1)
     expected_px = plain_pick(plain_sums(expected, own, searched), first_px)
     np.testing.assert_allclose(found_px[searched], expected_px[searched], atol=1e-5)
     np.testing.assert_allclose(found_px[~searched], given.disparity_px[~searched], atol=1 / 16)
@@ -171,7 +188,7 @@ def test_each_tile_searches_from_the_least_disparity_of_the_tiles_around(rng, mo
     first_px, count = refining._candidates(given)
     right_trust = refining.right_confidence(given)
     own = refining._cues(left, given.disparity_px - first_px, given.confidence)
-    other = refining._cues(right, given.right_disparity_px - first_px, right_trust)
+    other = refining._cues(right, given.right_disparity_px - first_px, np.float32(0.7) * right_trust)
     searched = refining.find_searched(given.confidence)
     costs = plain_costs(own, other, first_px, count)
     expected_px = plain_pick(plain_sums(costs, own, searched), first_px)
@@ -183,13 +200,12 @@ def test_each_tile_searches_from_the_least_disparity_of_the_tiles_around(rng, mo
 
 def test_both_views_settle_as_the_plain_ones(rng):
     left, right, given = random_pair(rng)
-    found_px = refining._match_views(
-        StereoPair(left=left, right=right), given, refining.right_confidence(given), 1
-    )
+    right_trust = refining.right_confidence(given)
+    found_px = refining._match_views(StereoPair(left=left, right=right), given, right_trust, 1)
     refined = refine(left, right, given)
     expected = plain_settled(given.disparity_px, *found_px, given.confidence, -1)
     np.testing.assert_array_equal(refined.disparity_px, expected)
-    expected = plain_settled(given.right_disparity_px, *found_px[::-1], refining.right_confidence(given), 1)
+    expected = plain_settled(given.right_disparity_px, *found_px[::-1], np.float32(0.7) * right_trust, 1)
     np.testing.assert_array_equal(refined.right_disparity_px, expected)
     assert (refined.disparity_px != given.disparity_px).any()
 
@@ -197,13 +213,12 @@ def test_both_views_settle_as_the_plain_ones(rng):
 def test_a_right_view_is_matched_as_the_left_one_of_the_mirrored_pair(scene):
     left, right, _, right_px = scene
     pair, given = StereoPair(left=left, right=right), estimate_of(right_px, right_px, confidence=0)
+    # Which certain pixels of the right view are searched depends on what is found in the left one.
     trust = np.zeros(right_px.shape, np.float32)
-    trust[10:30, 30:100] = 0.9
-    given = Estimate(**vars(given) | {"confidence": trust})
     found_px, right_found_px = refining._match_views(pair, given, trust, 1)
     turned = {name: values[:, ::-1].copy() for name, values in vars(given).items() if name in MAPS}
     mirrored_px, right_mirrored_px = refining._match_views(
-        pair.mirror(), Estimate(**vars(given) | turned), trust[:, ::-1].copy(), 1
+        pair.mirror(), Estimate(**vars(given) | turned), trust, 1
     )
     np.testing.assert_array_equal(mirrored_px[:, ::-1], right_found_px)
     np.testing.assert_array_equal(right_mirrored_px[:, ::-1], found_px)
