@@ -96,7 +96,7 @@ def found_raw(testdata, name):
     [
         ("small", False, (1.2, 18.0, 11.6)),
         ("small", True, (0.9, 13.6, 8.2)),
-        ("base", False, (0.72, 9.6, 5.0)),
+        ("base", False, (0.72, 9.5, 5.0)),
     ],
 )
 def test_on_real_pairs_the_network_is_as_good_as_promised(testdata, name, refined, most):

@@ -6,6 +6,8 @@ from jaxtyping import Bool, Float, Shaped
 
 OCCLUSION_STEP_PX = 1.0
 """Matching tolerance: a pixel is occluded if the surface at its match is nearer by more than this."""
+# Edges of the right view's disparity are coarse (decision 0035), so a match may be four columns aside.
+_ASIDE = np.ones((1, 9), np.uint8)
 # Number of rows checked at once, because checking all of a 50-megapixel image would take another gigabyte.
 _BAND_ROWS = 256
 
@@ -37,6 +39,15 @@ def is_occluded(
 ) -> Bool[np.ndarray, "h w"]:
     """Return the mask of pixels that only the left camera sees, judging by the views' disagreement."""
     return ~inside | (disagreement_px > OCCLUSION_STEP_PX)
+
+
+def find_contradicted(
+    disparity_px: Float[np.ndarray, "h w"], right_disparity_px: Float[np.ndarray, "h w"]
+) -> Bool[np.ndarray, "h w"]:
+    """Return the mask of left pixels at whose match, and four columns around, the right view sees farther."""
+    nearest_px = cv2.dilate(right_disparity_px, _ASIDE)
+    disagreement_px, inside = measure_disagreement(disparity_px, nearest_px)
+    return inside & (disagreement_px < -OCCLUSION_STEP_PX)
 
 
 def at_match(

@@ -19,7 +19,7 @@ from stereoweave.arguments import check_kind
 from stereoweave.errors import MatcherError, StereoweaveError
 from stereoweave.io.images import SMALLEST_SIDE_PX
 from stereoweave.matching.edge_vote.vote import sharpen_edges, vote_at_edges
-from stereoweave.matching.left_right_check import OCCLUSION_STEP_PX, is_occluded, measure_disagreement
+from stereoweave.matching.left_right_check import find_contradicted, is_occluded, measure_disagreement
 from stereoweave.matching.network import Network
 from stereoweave.matching.occlusion_fill import fill_occluded
 from stereoweave.matching.options import MatchOptions
@@ -395,10 +395,11 @@ def _estimate(left: UInt8[np.ndarray, "h w 3"], maps: Maps) -> Estimate:
     right_px = maps.right_disparity_px
     assert right_px is not None
     disagreement_px, inside = measure_disagreement(maps.disparity_px, right_px)
+    contradicted = find_contradicted(maps.disparity_px, right_px)
     return Estimate(
         disparity_px=maps.disparity_px,
         right_disparity_px=right_px,
-        confidence=_confidence(maps.confidence_logit, disagreement_px, inside, _find_plain(left)),
+        confidence=_confidence(maps.confidence_logit, disagreement_px, contradicted, _find_plain(left)),
         occluded=is_occluded(disagreement_px, inside),
     )
 
@@ -406,20 +407,20 @@ def _estimate(left: UInt8[np.ndarray, "h w 3"], maps: Maps) -> Estimate:
 def _confidence(
     logit: Float[np.ndarray, "h w"] | None,
     disagreement_px: Float[np.ndarray, "h w"],
-    inside: Bool[np.ndarray, "h w"],
+    contradicted: Bool[np.ndarray, "h w"],
     plain: Bool[np.ndarray, "h w"],
 ) -> Float[np.ndarray, "h w"]:
     """Return the confidence, from the network's log odds if given, else from the views' disagreement.
 
     A pixel's match cannot be farther than the pixel itself, because both cameras see the nearest surface.
-    Where the right view's disparity contradicts this, one of the two views is wrong, and the network's
+    Where the right view's disparities contradict this, one of the two views is wrong, and the network's
     probability is halved. On collages and real pairs, about a quarter of such pixels are correct, while the
     network claims a probability of 0.4 to 0.5. The confidence is 0 where the left image is plain.
 
     Args:
         logit: The network's log odds; None if the network has no such output.
         disagreement_px: The right view's disparity at the match minus the left view's disparity.
-        inside: Mask of left pixels whose match is inside the right image.
+        contradicted: Result of `find_contradicted`.
         plain: Mask of left pixels without texture to match.
     """
     if logit is None:
@@ -427,7 +428,6 @@ def _confidence(
     else:
         # The logistic function, in a form that does not overflow.
         probability = 0.5 * (1 + np.tanh(logit / 2))
-        contradicted = inside & (disagreement_px < -OCCLUSION_STEP_PX)
         np.multiply(probability, 0.5, out=probability, where=contradicted)
     probability[plain] = 0
     return probability

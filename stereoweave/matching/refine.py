@@ -1,7 +1,8 @@
 """Refinement of an estimate by matching once more at full resolution, with the network's disparity as prior.
 
 The method is semi-global matching (Hirschmueller 2008) at and around pixels of which the network is not
-certain, over all disparities from the network's least one nearby to its greatest one. A candidate's cost is
+certain, and right pixels that match newly found left disparities, over all disparities from the network's
+least one nearby to its greatest one. A candidate's cost is
 the colour and census difference, plus the confidence-weighted distance to the network's disparity. Where both
 views agree, the found disparities replace the network's. This recovers edges, as well as thin structures that
 are below the network's resolution.
@@ -34,8 +35,8 @@ _OVERLAP_PX = 64  # two tiles
 # Penalty for a large disparity step: greatest between equal grey levels, halved at this grey difference.
 _LARGEST_STEP, _LEAST_LARGE_STEP = 125, 30
 _HALVING_LEVELS = 30
-# Disparities are searched up to this far from those that are not certain: 36 % of the pixels of real pairs.
-# New views gain 0.1 dB from a search everywhere, and lose 0.3 dB without the pixels around.
+# Disparities are searched up to this far from those that are not certain: 36 % of the left pixels of real
+# pairs. New views gain 0.1 dB from a search everywhere, and lose 0.3 dB without the pixels around.
 _REACH_PX = 4
 _AROUND = np.ones((2 * _REACH_PX + 1, 2 * _REACH_PX + 1), np.uint8)
 _BESIDE = np.ones((1, 3), np.uint8)
@@ -45,8 +46,8 @@ _TILES_AROUND = np.ones((3, 3), np.uint8)
 # Factor on a pixel's confidence where the network's disparities for the two views disagree.
 _DOUBTED = 0.2
 _SAME_PX = 1.0
-# Factor on the confidence of the right view's disparities. They lack the network's last refinement (decision
-# 0035), so matching may move them further.
+# Factor on the confidence of the right view's disparities, because those of the shipped networks lack the
+# last refinement (decision 0035). None then reaches CERTAIN, so any of them that is searched may be replaced.
 _COARSE = np.float32(0.7)
 _MOST_THREADS = 4
 
@@ -82,8 +83,8 @@ def refine(
     """Correct the disparities of both views by semi-global matching at full resolution.
 
     The network's disparity is kept where matching confirms it to within 1 px (the network is then more
-    precise), where its confidence is high, and where the two views disagree. The confidence does not change.
-    Different exposures are equalised first.
+    precise), where the left view's confidence is high, and where the two views disagree. The confidence does
+    not change. Different exposures are equalised first.
 
     Args:
         left: Left image, uint8 RGB [H, W, 3].
@@ -158,7 +159,7 @@ def _match_views(
     right = _cues(pair.right, estimate.right_disparity_px - first_px, _COARSE * right_trust)
     left_view = _View(left, _align(right, first_px, count, -1), find_searched(estimate.confidence), -1)
     found_px = _match_view(left_view, first_px, count, threads)
-    right_searched = find_searched(right_trust) | find_matches_of_changed(estimate.disparity_px, found_px)
+    right_searched = find_searched(right_trust) | find_matches_of_found(estimate.disparity_px, found_px)
     right_view = _View(right, _align(left, first_px, count, 1), right_searched, 1)
     return found_px, _match_view(right_view, first_px, count, threads)
 
@@ -216,13 +217,18 @@ def find_searched(trust: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     return cv2.dilate((trust < kernels.CERTAIN).astype(np.uint8), _AROUND) > 0
 
 
-def find_matches_of_changed(
+def find_matches_of_found(
     disparity_px: Float[np.ndarray, "h w"], found_px: Float32[np.ndarray, "h w"]
 ) -> Bool[np.ndarray, "h w"]:
-    """Return the mask of the right pixels, and around, that match left ones whose disparity was replaced.
+    """Return the mask of right pixels that match left ones for which the search found another disparity.
 
-    There the right view's network may be certain of the background of a thin thing that only the left view's
-    search has found. New views gain 0.3 dB, as much as from a search of the whole right view.
+    Pixels around them are included. There the network may be certain, in the right view, of the background of
+    a thin structure that the left view's search has found. New views gain 0.3 dB, as much as from a search of
+    the whole right view.
+
+    Args:
+        disparity_px: The network's disparity of the left view.
+        found_px: The disparity that the search found.
     """
     from stereoweave.matching import refine_kernels as kernels  # it loads LLVM
 

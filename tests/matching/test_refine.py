@@ -92,6 +92,17 @@ def test_a_stick_is_found_in_the_right_view_where_its_network_is_certain_of_the_
     assert (abs(refined.disparity_px[:, in_left] - stick_px) < 1).mean() > 0.95
 
 
+def test_the_right_view_is_searched_up_to_4_px_from_the_matches_of_newly_found_left_disparities():
+    disparity_px = np.zeros((11, 20), np.float32)
+    found_px = disparity_px.copy()
+    found_px[5, 14] = 6  # it matches column 8
+    found_px[5, 3] = 6  # it matches none
+    found_px[2, 18] = 1  # too little
+    expected = np.zeros((11, 20), bool)
+    expected[1:10, 4:13] = True
+    np.testing.assert_array_equal(refining.find_matches_of_found(disparity_px, found_px), expected)
+
+
 def test_correct_disparities_do_not_change_by_a_bit(scene):
     left, right, left_px, right_px = scene
     given = estimate_of(np.where(np.isnan(left_px), FAR_PX, left_px) + 0.3, right_px + 0.3, confidence=0.8)
@@ -210,15 +221,19 @@ def test_both_views_settle_as_the_plain_ones(rng):
     assert (refined.disparity_px != given.disparity_px).any()
 
 
-def test_a_right_view_is_matched_as_the_left_one_of_the_mirrored_pair(scene):
+def test_a_right_view_is_matched_as_the_left_one_of_the_mirrored_pair(scene, monkeypatch):
+    # What makes the two views differ: the right one is coarser, and is searched after the left one.
+    monkeypatch.setattr(refining, "_COARSE", np.float32(1))
+    monkeypatch.setattr(refining, "find_matches_of_found", lambda _, found_px: np.zeros(found_px.shape, bool))
     left, right, _, right_px = scene
     pair, given = StereoPair(left=left, right=right), estimate_of(right_px, right_px, confidence=0)
-    # Which certain pixels of the right view are searched depends on what is found in the left one.
     trust = np.zeros(right_px.shape, np.float32)
+    trust[10:30, 30:100] = 0.9
+    given = Estimate(**vars(given) | {"confidence": trust})
     found_px, right_found_px = refining._match_views(pair, given, trust, 1)
     turned = {name: values[:, ::-1].copy() for name, values in vars(given).items() if name in MAPS}
     mirrored_px, right_mirrored_px = refining._match_views(
-        pair.mirror(), Estimate(**vars(given) | turned), trust, 1
+        pair.mirror(), Estimate(**vars(given) | turned), trust[:, ::-1].copy(), 1
     )
     np.testing.assert_array_equal(mirrored_px[:, ::-1], right_found_px)
     np.testing.assert_array_equal(right_mirrored_px[:, ::-1], found_px)

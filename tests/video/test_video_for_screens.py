@@ -105,7 +105,8 @@ def test_half_width_gives_the_values_of_the_full_width(tmp_path, capsys):
     for layout in ("side_by_side", "side_by_side_half"):
         assert run(video, tmp_path / "out.mp4", "--layout", layout, "--screen", "television") == 0
         line = capsys.readouterr().out.splitlines()[1]
-        values.append([float(number) for number in re.findall(r"-?\d+\.\d+", line)])
+        found = re.search(r"strength ([\d.]+)(?: to [\d.]+)?, convergence (-?[\d.]+) px", line)
+        values.append([float(number) for number in found.groups()])
     strength, convergence_px = values[0][0], values[0][1]
     assert values[1][0] == pytest.approx(strength, abs=0.06)
     assert values[1][1] == pytest.approx(convergence_px, abs=1.5)

@@ -210,21 +210,17 @@ def compare_runtimes(network: Any, matcher: Matcher, pair: StereoPair) -> tuple[
 
 
 def count_multiply_adds(network: nn.Module, height: int = 480, width: int = 640) -> int:
-    """Count the multiply-adds of the whole graph, including both views and all correlations."""
+    """Count the multiply-adds of the whole graph, including all correlations."""
     image = torch.rand(1, 3, height, width)
     with FlopCounterMode(display=False) as counter, torch.no_grad():
         network(image, image)
     counted = counter.get_total_flops() // 2
-    if not isinstance(network, WeaveNet):
-        return counted
-    *of_both, last = network.refinements
-    # The last refinement is of the left view alone, at 1/2 resolution. Each one before it is of both views,
-    # at half the resolution of its successor.
-    counted += last.products * height * width // 4
-    scales = (4**i for i in range(len(of_both) + 1, 1, -1))
-    return counted + sum(
-        2 * one.products * height * width // scale for one, scale in zip(of_both, scales, strict=True)
-    )
+    if isinstance(network, WeaveNet):
+        # The last refinement is at 1/2 resolution, of the left view alone; those before it are of both views.
+        for number, refinement in enumerate(reversed(network.refinements), 1):
+            views = 1 if number == 1 else 2
+            counted += views * refinement.products * height * width // 4**number
+    return counted
 
 
 def _make_card(kept: Checkpoint, network: nn.Module) -> dict[str, Any]:

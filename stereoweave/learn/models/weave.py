@@ -143,13 +143,14 @@ class WeaveStages:
 class CoarseStages:
     """Results of the stages before the last refinement, which are its inputs.
 
-    The batch holds the left views first, then the right views: mirrored, but for `context` and `match`.
+    The batch holds the left views first, then the right views. The right views' maps are mirrored, except
+    `context` and `match`.
 
     Attributes:
         correlation: As in `WeaveStages`.
         scores: As in `WeaveStages`.
         disparity: Disparity in half-resolution pixels [2B, 1, H/2, W/2].
-        context: The encoder's maps [2B, C, H/2, W/2].
+        context: Features of the images [2B, C, H/2, W/2].
         match: Features to correlate [2B, C, H/2, W/2].
         handed: Maps that the refinement gets from the stages before it [2B, C, H/2, W/2].
         upsampling_logits: Logits of the weights of each upsampling so far.
@@ -385,7 +386,8 @@ class WeaveNet(nn.Module):
         batch = left.shape[0]
         maps = self.encoder(torch.cat([left, right]))
         # A mirrored right view is a left view, so one aggregation serves both.
-        first = WeaveFeatures(*(as_left_view(map_, batch) for map_ in maps))
+        # The last refinement alone reads the map at 1/2 resolution, and arranges it itself.
+        first = WeaveFeatures(maps.half, *(as_left_view(map_, batch) for map_ in maps[1:]))
         correlation, scores, decoded = self.match(maps, first)
         quarter = self.read_disparity(scores.float(), decoded)
         spread, decoded = self._propagate(quarter, first.quarter, decoded, batch)
@@ -404,8 +406,23 @@ class WeaveNet(nn.Module):
         """Return both views' disparities in pixels, their confidence logits, and the upsampling's logits."""
         batch = coarse.match.shape[0] // 2
         context, match = as_left_view(coarse.context, batch), as_matched_pixels(coarse.match, batch)
-        fine, logits, confidence = refinement(coarse.disparity, *match, context, coarse.handed)
-        return self.upsample(fine * 2, logits.float()), confidence.float(), logits.float()
+        return self._refine(refinement, coarse.disparity, match, context, coarse.handed)
+
+    def _refine(
+        self,
+        refinement: Refinement,
+        disparity: Tensor,
+        match: tuple[Tensor, Tensor],
+        context: Tensor,
+        handed: Tensor,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return what `refine_both` returns, for the views whose maps are given.
+
+        `match` holds the features of these views and of the other ones, each [B, H/2, W/2, C].
+        """
+        fine, logits, confidence = refinement(disparity, *match, context, handed)
+        logits = logits.float()
+        return self.upsample(fine * 2, logits), confidence.float(), logits
 
     def match(self, maps: WeaveFeatures, first: WeaveFeatures) -> tuple[Tensor, Tensor, Tensor]:
         """Return the matching scores before and after aggregation, and the decoder's features.
@@ -441,19 +458,18 @@ class WeaveNet(nn.Module):
     def forward(self, left: Tensor, right: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return both views' disparities and the left view's confidence logit, each [B, 1, H, W].
 
-        The right view's disparity lacks the last refinement, which is a tenth of the time: it serves to check
-        the left one's.
+        The right view's disparity, which serves the left-right check and new views, lacks the last
+        refinement. That would take a tenth of BASE_GROWN's time, and a fifth of a `WeaveHalfNet`'s.
         """
         coarse, batch = self.estimate_coarse(left, right), left.shape[0]
         match = coarse.match.permute(0, 2, 3, 1)
-        fine, logits, confidence = self.refinements[-1](
+        left_px, confidence_logit, _ = self._refine(
+            self.refinements[-1],
             coarse.disparity[:batch],
-            match[:batch],
-            match[batch:],
+            (match[:batch], match[batch:]),
             coarse.context[:batch],
             coarse.handed[:batch],
         )
-        left_px = self.upsample(fine * 2, logits.float())
         right_px = mirror(F.interpolate(coarse.disparity[batch:] * 2, scale_factor=2.0))
         # Noise at infinity has both signs, but parallel cameras have no negative disparities.
-        return left_px.clamp(min=0), right_px.clamp(min=0), confidence.float()
+        return left_px.clamp(min=0), right_px.clamp(min=0), confidence_logit

@@ -62,8 +62,8 @@ class Enlargement(Refinement):
 class WeaveHalfNet(WeaveNet):
     """WeaveNet for images of half the size, whose disparity is then refined and upsampled to the full size.
 
-    With HALF it takes as long as a WeaveNet of size SMALL. Its training can start from the weights of a
-    WeaveNet.
+    With HALF it takes about as long as a WeaveNet of size SMALL. Its training can start from the weights of
+    a WeaveNet.
 
     The sides of the images must be multiples of 32, or of 64 if `size` has a context at 1/32 resolution. Its
     levels reach twice as far as those of a WeaveNet; its range ends where training pairs make it reliable.
@@ -110,7 +110,7 @@ def _halve(image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h2 w2"]:
     """Return the image at half its size, whose pixels are the means of 2x2 pixels.
 
     Bilinear interpolation gives the same, in a quarter of the time of ONNX Runtime's average. The size is
-    given instead of the scale, with which an export takes three times as long: each size that follows would
-    be a rounded fraction.
+    given, not the scale: PyTorch's exporter writes every size after a scaling as a rounded fraction, and the
+    export takes three times as long.
     """
     return F.interpolate(image, size=(image.shape[2] // 2, image.shape[3] // 2), mode="bilinear")

@@ -101,6 +101,7 @@ def test_the_matcher_file_answers_as_pytorch_does_and_nothing_is_written_otherwi
     for found, alone in zip(matcher.estimate_many([pair, mirrored]), (pair, mirrored), strict=True):
         expected = matcher.estimate(alone.left, alone.right)
         np.testing.assert_allclose(found.disparity_px, expected.disparity_px, atol=1e-3)
+        np.testing.assert_allclose(found.right_disparity_px, expected.right_disparity_px, atol=1e-3)
         np.testing.assert_allclose(found.confidence, expected.confidence, atol=1e-3)
     assert [side.dim_param for side in graph.graph.input[0].type.tensor_type.shape.dim][:2] == ["batch", ""]
 
@@ -214,10 +215,17 @@ def test_multiply_adds_include_layers_and_products():
     assert export.count_multiply_adds(OneLayer(), height, width) == layer + product
 
 
-def test_multiply_adds_count_the_refinement_of_weavenet():
-    network, image = untrained("weave_base"), torch.rand(1, 3, 16, 32)
+@pytest.mark.parametrize(
+    ("name", "refinements"),
+    [
+        # At half the resolution, each left pixel compares 16 features with those of 6 columns.
+        ("weave_base", 16 * 48 * 16 * 6),
+        # 8 features with those of 5 columns: at half the resolution of the left view, at a quarter of both.
+        ("weave_half", 16 * 48 * 8 * 5 + 2 * 8 * 24 * 8 * 5),
+    ],
+)
+def test_multiply_adds_count_the_refinements_of_weavenet(name, refinements):
+    network, image = untrained(name), torch.rand(1, 3, 32, 96)
     with FlopCounterMode(display=False) as counter, torch.no_grad():
         network(image, image)
-    # At half the resolution, the left view compares 16 features with those of 6 columns.
-    refinement = 8 * 16 * 16 * 6
-    assert export.count_multiply_adds(network, 16, 32) == counter.get_total_flops() // 2 + refinement
+    assert export.count_multiply_adds(network, 32, 96) == counter.get_total_flops() // 2 + refinements

@@ -58,7 +58,7 @@ def test_the_network_overfits_one_pair():
     assert trained.error_after_px < trained.error_before_px / 5
 
 
-def test_a_mirrored_pair_gives_mirrored_results():
+def test_in_training_a_mirrored_pair_gives_mirrored_results():
     """Use a mirror-symmetric encoder, with which the results are mirrored exactly."""
     # In double precision, because rounding could decide between two levels that match equally well.
     network = untrained().double()

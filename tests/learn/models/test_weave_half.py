@@ -60,7 +60,7 @@ def test_the_last_refinement_moves_a_disparity_by_at_most_two_pixels_of_the_halv
     torch.testing.assert_close(stages.disparity_px, unmoved_px + moved_px, atol=1e-3, rtol=0)
 
 
-def test_the_right_view_is_the_left_view_of_the_mirrored_pair():
+def test_in_training_the_right_view_is_the_left_view_of_the_mirrored_pair():
     network = untrained("weave_half").double()
     with torch.no_grad():
         for part in (network.encoder, network.stem):
@@ -76,7 +76,7 @@ def test_the_right_view_is_the_left_view_of_the_mirrored_pair():
     assert (left_px - right_px).abs().max() > 0.1
 
 
-def test_the_right_view_is_that_of_the_halved_images_at_twice_their_size():
+def test_the_right_view_alone_is_that_of_the_halved_images_at_twice_their_size():
     network = untrained("weave_half")
     pair = random_pair(2, 64, 96)
     with torch.no_grad():
