@@ -44,7 +44,7 @@ def is_occluded(
 def find_contradicted(
     disparity_px: Float[np.ndarray, "h w"], right_disparity_px: Float[np.ndarray, "h w"]
 ) -> Bool[np.ndarray, "h w"]:
-    """Return the mask of left pixels at whose match, and four columns around, the right view sees farther."""
+    """Return the mask of left pixels that are nearer than their match and the four columns on each side."""
     nearest_px = cv2.dilate(right_disparity_px, _ASIDE)
     disagreement_px, inside = measure_disagreement(disparity_px, nearest_px)
     return inside & (disagreement_px < -OCCLUSION_STEP_PX)
