@@ -29,9 +29,14 @@ class Budget:
 
     A request is refused permanently if it could not finish in time even at the best speed so far. It is
     refused temporarily if, at the median of recent speeds, it would be late after all accepted requests.
+
+    Args:
+        seconds_each: Seconds per unit of work.
+        refines: Whether every estimate is refined (`Matcher.refines`), so that the option adds no work.
     """
 
-    def __init__(self, seconds_each: float) -> None:
+    def __init__(self, seconds_each: float, *, refines: bool = False) -> None:
+        self._refines = refines
         self._accepted: list[float] = []
         self._best_each_s = seconds_each
         self._latest_each_s = deque([seconds_each], _LATEST)
@@ -44,7 +49,7 @@ class Budget:
             TooLargeError: If the job alone would take longer than `left_s`.
             BusyError: If the job would take longer than `left_s` after all previously accepted jobs.
         """
-        work = estimate_work(job, megapixels)
+        work = self.estimate_work(job, megapixels)
         least_s = work * self._best_each_s
         if least_s > left_s:
             raise TooLargeError(
@@ -72,9 +77,8 @@ class Budget:
             each_s = max(each_s, median(self._latest_each_s))
         self._latest_each_s.append(each_s)
 
-
-def estimate_work(job: ServiceJob, megapixels: float) -> float:
-    """Return the amount of work in a job. One unit is a megapixel of small pictures, without refinement."""
-    large = _LARGE if megapixels > _LARGE_FROM_MEGAPIXELS else 1
-    refined = _REFINED if job.match_options.refined else 1
-    return megapixels * large * refined
+    def estimate_work(self, job: ServiceJob, megapixels: float) -> float:
+        """Return the amount of work in a job. One unit is a megapixel of small pictures, without options."""
+        large = _LARGE if megapixels > _LARGE_FROM_MEGAPIXELS else 1
+        refined = _REFINED if job.match_options.refined and not self._refines else 1
+        return megapixels * large * refined

@@ -26,8 +26,8 @@ from ray.serve.schema import LoggingConfig
 
 from stereoweave.errors import Remedy, StereoweaveError
 from stereoweave.matching.backend import Backend
-from stereoweave.matching.matcher import Matcher
-from stereoweave.service.admission import Budget, estimate_work
+from stereoweave.matching.matcher import MODES, Matcher
+from stereoweave.service.admission import Budget
 from stereoweave.service.answers import ServiceAnswer, ServiceJob, load_answerer
 from stereoweave.service.asgi import FAILURES, Guard, Limits, make_app
 from stereoweave.service.folders import make_own_folder
@@ -95,7 +95,7 @@ class Replica:
         self._folder = self._resources.enter_context(make_own_folder())
         self._processes = _make_processes(settings, self._folder)
         self._resources.callback(self._processes.close)
-        self._budget = Budget(self._processes.warm_up())
+        self._budget = Budget(self._processes.warm_up(), refines=settings.model in MODES)
         # One thread per process: a call that waits for its thread has not been sent and can be cancelled.
         self._measuring_thread, self._answering_thread = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
         self._idle = asyncio.Event()
@@ -140,7 +140,7 @@ class Replica:
         finally:
             self._idle.set()
         if all(isinstance(answer, ServiceAnswer | TimeoutError) for answer in answers):
-            work = sum(estimate_work(timed.job, timed.megapixels) for timed in timed_jobs)
+            work = sum(self._budget.estimate_work(timed.job, timed.megapixels) for timed in timed_jobs)
             finished = all(isinstance(answer, ServiceAnswer) for answer in answers)
             self._budget.learn(work, time.perf_counter() - start_s, finished=finished)
         return answers

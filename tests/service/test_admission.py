@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from stereoweave.matching.options import MatchOptions
-from stereoweave.service.admission import Budget, BusyError, estimate_work
+from stereoweave.service.admission import Budget, BusyError
 from stereoweave.service.answers import ServiceJob, TooLargeError
 
 
@@ -67,7 +67,12 @@ def test_an_unfinished_job_slows_the_usual_speed_but_leaves_the_best_speed_uncha
 
 
 def test_large_pictures_and_full_resolution_are_more_work():
-    assert estimate_work(job(), 0.6) == 0.6
-    assert estimate_work(job(), 50) == 125
-    assert estimate_work(job(options=MatchOptions(refined=True)), 1) == 1.3
-    assert estimate_work(job(file="view.png"), 1) == 1.3
+    budget = Budget(seconds_each=2)
+    assert budget.estimate_work(job(), 0.6) == 0.6
+    assert budget.estimate_work(job(), 50) == 125
+    assert budget.estimate_work(job(options=MatchOptions(refined=True)), 1) == 1.3
+    assert budget.estimate_work(job(file="view.png"), 1) == 1.3
+
+
+def test_full_resolution_is_no_more_work_for_a_matcher_that_always_refines():
+    assert Budget(seconds_each=2, refines=True).estimate_work(job(file="view.png"), 1) == 1
