@@ -106,6 +106,12 @@ def untrained(name="weave_small"):
     return build_network(recipe_of(name)).eval()
 
 
+def random_pair(batch, height, width):
+    """Return the same noise at every call, as the left and right images of a batch."""
+    torch.manual_seed(1)
+    return torch.rand(batch, 3, height, width), torch.rand(batch, 3, height, width)
+
+
 def checkpoint_of(network, recipe=RECIPE):
     weights = network.state_dict()
     return Checkpoint(

@@ -119,13 +119,24 @@ def test_the_confidence_of_an_extreme_logit_is_0_or_1():
     assert found.dtype == np.float32
 
 
-def test_confidence_is_halved_where_the_views_contradict_and_0_in_plain_areas():
-    # The odds are even everywhere.
-    contradicted = np.array([[True, False, False, True]])
-    plain = np.array([[False, False, True, True]])
-    nothing = np.zeros((1, 4), np.float32)
-    found = matcher._confidence(nothing, nothing, contradicted, plain)
-    np.testing.assert_array_equal(found, [[0.25, 0.5, 0, 0]])
+def test_confidence_is_halved_where_no_right_disparity_within_four_columns_is_as_near(tmp_path, rng):
+    nodes = [
+        *red_of("left", "disparity_px"),
+        *red_of("right", "right_disparity_px"),
+        helper.make_node("Sub", ["disparity_px", "disparity_px"], ["confidence_logit"]),
+    ]
+    outputs = ["disparity_px", "right_disparity_px", "confidence_logit"]
+    even_odds = Matcher(matcher_file(tmp_path / "even.onnx", nodes, outputs))
+    # Two boards at disparity 10 before a wall at 4. The right view has the first one's left edge, at column
+    # 10, two columns late, and misses the second board.
+    left_px, right_px = np.full((32, 100), 4), np.full((32, 100), 4)
+    left_px[:, 20:30] = left_px[:, 60:66] = 10
+    right_px[:, 12:20] = 10
+    left, right = painted(left_px), painted(right_px)
+    left[:, :, 1] = rng.integers(0, 256, (32, 100))  # a plain picture has no confidence
+    expected = np.full((32, 100), 0.5)
+    expected[:, 60:66] = 0.25
+    np.testing.assert_array_equal(even_odds.estimate(left, right, raw=True).confidence, expected)
 
 
 def test_without_a_logit_confidence_depends_on_the_disagreement():

@@ -4,19 +4,12 @@ from dataclasses import replace
 
 import pytest
 import torch
-from learn_examples import overfitted, untrained
-from torch import nn
+from learn_examples import overfitted, random_pair, untrained
 
 from stereoweave.learn.export.from_checkpoint import count_multiply_adds
-from stereoweave.learn.models.layers import mirror
 from stereoweave.learn.models.weave import BASE, BASE_GROWN, WeaveNet
 from stereoweave.learn.models.weave_stages import OFFSETS, Completion
 from stereoweave.learn.training.losses import weave_losses
-
-
-def random_pair(batch, height, width):
-    torch.manual_seed(1)
-    return torch.rand(batch, 3, height, width), torch.rand(batch, 3, height, width)
 
 
 @pytest.mark.parametrize("size", [(16, 16), (32, 32), (16, 112), (48, 80), (112, 32)])
@@ -56,38 +49,6 @@ def test_the_network_overfits_one_pair():
     trained = overfitted()
     assert trained.error_after_px < 1
     assert trained.error_after_px < trained.error_before_px / 5
-
-
-def test_in_training_a_mirrored_pair_gives_mirrored_results():
-    """Use a mirror-symmetric encoder, with which the results are mirrored exactly."""
-    # In double precision, because rounding could decide between two levels that match equally well.
-    network = untrained().double()
-    with torch.no_grad():
-        for layer in network.encoder.modules():
-            if isinstance(layer, nn.Conv2d):
-                layer.weight += mirror(layer.weight.clone())
-        left, right = (image.double() for image in random_pair(1, 48, 80))
-        left_px, right_px = network.stages(left, right).disparity_px
-        mirrored_right_px, mirrored_left_px = network.stages(mirror(right), mirror(left)).disparity_px
-    # The stages of a right view are mirrored.
-    torch.testing.assert_close(left_px, mirrored_left_px, atol=1e-3, rtol=0)
-    torch.testing.assert_close(right_px, mirrored_right_px, atol=1e-3, rtol=0)
-    assert (left_px - right_px).abs().max() > 0.1
-
-
-def test_the_left_view_is_refined_as_in_the_stages_and_the_right_one_is_their_coarse_disparity():
-    network = untrained()
-    pair = random_pair(2, 32, 64)
-    with torch.no_grad():
-        stages = network.stages(*pair)
-        left_px, right_px, logit = network(*pair)
-    torch.testing.assert_close(left_px, stages.disparity_px[:2].clamp(min=0))
-    torch.testing.assert_close(logit, stages.confidence_logit[:2])
-    # The stages of a right view are mirrored. Each of its pixels at half the resolution becomes 2x2.
-    coarse_px = mirror(stages.coarse_px[2:]).clamp(min=0)
-    assert torch.equal(right_px, coarse_px.repeat_interleave(2, 2).repeat_interleave(2, 3))
-    assert stages.correlation.shape == stages.scores.shape == (4, network.levels, 8, 16)
-    assert stages.coarse_px.shape == (4, 1, 16, 32)
 
 
 def test_a_disparity_below_zero_becomes_zero():
@@ -138,23 +99,6 @@ def test_every_stage_of_a_grown_network_learns():
     grown_by = ("completion.", "aggregation.context.wider.")
     for name, parameter in network.named_parameters():
         assert not name.startswith(grown_by) or parameter.grad.any(), name
-
-
-def test_a_mirrored_pair_is_completed_alike():
-    """Use mirror-symmetric features; the completion receives each view with the other in its own columns."""
-    torch.manual_seed(0)
-    network = WeaveNet(BASE_GROWN).eval().double()
-    nn.init.normal_(network.completion.share.weight, std=0.5)
-    with torch.no_grad():
-        for layer in network.encoder.modules():
-            if isinstance(layer, nn.Conv2d):
-                layer.weight += mirror(layer.weight.clone())
-        left, right = (image.double() for image in random_pair(1, 64, 96))
-        left_px, right_px = network.stages(left, right).disparity_px
-        mirrored_right_px, mirrored_left_px = network.stages(mirror(right), mirror(left)).disparity_px
-    # The stages of a right view are mirrored.
-    torch.testing.assert_close(left_px, mirrored_left_px, atol=1e-3, rtol=0)
-    torch.testing.assert_close(right_px, mirrored_right_px, atol=1e-3, rtol=0)
 
 
 def test_a_completion_takes_the_surface_that_its_affinities_point_to():

@@ -3,17 +3,11 @@
 import pytest
 import torch
 import torch.nn.functional as F
-from learn_examples import overfitted, untrained
+from learn_examples import overfitted, random_pair, untrained
 
 from stereoweave.learn.export.from_checkpoint import count_multiply_adds
-from stereoweave.learn.models.layers import mirror
 from stereoweave.learn.models.weave import WeaveNet
 from stereoweave.learn.models.weave_half import HALF, WeaveHalfNet
-
-
-def random_pair(batch, height, width):
-    torch.manual_seed(1)
-    return torch.rand(batch, 3, height, width), torch.rand(batch, 3, height, width)
 
 
 @pytest.mark.parametrize("size", [(32, 32), (64, 160), (96, 64)])
@@ -58,34 +52,6 @@ def test_the_last_refinement_moves_a_disparity_by_at_most_two_pixels_of_the_halv
         stages = network.stages(*random_pair(1, 64, 96))
         unmoved_px = network.upsample(stages.coarse_px, torch.zeros(2, 16, 32, 48))
     torch.testing.assert_close(stages.disparity_px, unmoved_px + moved_px, atol=1e-3, rtol=0)
-
-
-def test_in_training_the_right_view_is_the_left_view_of_the_mirrored_pair():
-    network = untrained("weave_half").double()
-    with torch.no_grad():
-        for part in (network.encoder, network.stem):
-            for layer in part.modules():
-                if isinstance(layer, torch.nn.Conv2d):
-                    layer.weight += mirror(layer.weight.clone())
-        left, right = (image.double() for image in random_pair(1, 64, 96))
-        left_px, right_px = network.stages(left, right).disparity_px
-        mirrored_right_px, mirrored_left_px = network.stages(mirror(right), mirror(left)).disparity_px
-    # The stages of a right view are mirrored.
-    torch.testing.assert_close(left_px, mirrored_left_px, atol=1e-3, rtol=0)
-    torch.testing.assert_close(right_px, mirrored_right_px, atol=1e-3, rtol=0)
-    assert (left_px - right_px).abs().max() > 0.1
-
-
-def test_the_right_view_alone_is_that_of_the_halved_images_at_twice_their_size():
-    network = untrained("weave_half")
-    pair = random_pair(2, 64, 96)
-    with torch.no_grad():
-        stages = network.stages(*pair)
-        left_px, right_px, logit = network(*pair)
-    torch.testing.assert_close(left_px, stages.disparity_px[:2].clamp(min=0))
-    torch.testing.assert_close(logit, stages.confidence_logit[:2])
-    coarse_px = mirror(stages.coarse_px[2:]).clamp(min=0)
-    assert torch.equal(right_px, coarse_px.repeat_interleave(2, 2).repeat_interleave(2, 3))
 
 
 def test_the_range_ends_at_256_px_or_with_the_levels():
