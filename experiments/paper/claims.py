@@ -102,28 +102,33 @@ _COLUMNS = {
 }
 # A measure that a setting is claimed to lower: column, label, the paper's words, percent.
 _Measure = tuple[str, str, str, float | None]
+# Column of the end-point error in the unit of the target, cm or px.
+_EPE = "epe"
 _VIEW: _Measure = ("mae_filled", "MAE of the right view", "-", None)
 _ADJUSTMENT: tuple[_Measure, ...] = (
     (
         "prediction",
-        "validation loss, each in its own code (smaller by construction)",
+        "validation loss, each in its own code (not comparable)",
         "about 15 %",
         15.0,
     ),
     ("squared_error", "validation loss, codes without exponent", "about 15 %", 15.0),
-    ("epe_px", "end-point error", "up to 20 %", 20.0),
+    (_EPE, "end-point error", "up to 20 %", 20.0),
     _VIEW,
 )
+# For exponents that the paper does not claim to be the best.
+_OTHER_EXPONENT: tuple[_Measure, ...] = ((_EPE, "end-point error", "-", None), _VIEW)
+_IN_PX: _Measure = ("epe_px", "end-point error in px", "-", None)
 _PROJECTION: tuple[_Measure, ...] = (
-    ("epe_px", "end-point error", "about 20 %, up to 25 %", 20.0),
+    (_EPE, "end-point error", "about 20 %, up to 25 %", 20.0),
     ("prediction", "loss between codes", "about 20 %", 20.0),
     _VIEW,
 )
 # The paper has no number for the decoder alone: Table I combines it with the two contributions.
-_DECODER: tuple[_Measure, ...] = (("epe_px", "end-point error", "-", None), _VIEW)
+_DECODER: tuple[_Measure, ...] = ((_EPE, "end-point error", "-", None), _VIEW)
 # Text of a claim, its name in trials.py, reference setting, changed setting, measures.
-_CHANGES = (
-    ("depth adjustment, p = 1.5 against 1", ADJUSTMENT, "p = 1", "p = 1.5", _ADJUSTMENT),
+_Change = tuple[str, str, str, str, tuple[_Measure, ...]]
+_CHANGES: tuple[_Change, ...] = (
     ("projection loss", PROJECTION, "without", PAPER, _PROJECTION),
     ("step-wise decoder with skips", DECODER, "upsampled at once, no skips", PAPER, _DECODER),
 )
@@ -131,9 +136,15 @@ _CHANGES = (
 RUN_TIMES = {"fast_depth": 1.05, "densemapnet": 1.0, "dispnet": 2.0, "psmnet": 10.0}
 
 
-def list_comparisons(depth: bool = False) -> Iterator[Comparison]:
-    """Yield the claims that one number can decide. With `depth` as the target, end-point errors are in cm."""
-    for text, claim, reference, changed, measures in (*_CHANGES, *_rival_changes(depth)):
+def list_comparisons(depth: bool = False, exponents: Iterable[str] = ()) -> Iterator[Comparison]:
+    """Yield the claims that one number can decide.
+
+    Args:
+        depth: Whether depth is the target; end-point errors are then in cm.
+        exponents: Settings of the depth adjustment to compare with p = 1 in addition to p = 1.5.
+    """
+    changes = (*_list_exponents(depth, exponents), *_CHANGES, *_rival_changes(depth))
+    for text, claim, reference, changed, measures in changes:
         for measure, name, paper, percent in measures:
             yield Comparison(
                 text=f"{text}: {name}",
@@ -142,11 +153,19 @@ def list_comparisons(depth: bool = False) -> Iterator[Comparison]:
                 claim=claim,
                 reference=reference,
                 changed=changed,
-                measure="epe_cm" if depth and measure == "epe_px" else measure,
+                measure=("epe_cm" if depth else "epe_px") if measure == _EPE else measure,
             )
 
 
-def _rival_changes(depth: bool) -> Iterator[tuple[str, str, str, str, tuple[_Measure, ...]]]:
+def _list_exponents(depth: bool, others: Iterable[str]) -> Iterator[_Change]:
+    """Yield the depth adjustments, as rows of _CHANGES."""
+    # A code with a larger exponent is finer where depths are small, so errors of near pixels count as well.
+    in_px = (_IN_PX,) if depth else ()
+    for setting, measures in (("p = 1.5", _ADJUSTMENT), *((other, _OTHER_EXPONENT) for other in others)):
+        yield f"depth adjustment, {setting} against 1", ADJUSTMENT, "p = 1", setting, (*measures, *in_px)
+
+
+def _rival_changes(depth: bool) -> Iterator[_Change]:
     """Yield Table I's claims about each rival, as rows of _CHANGES; with `depth`, only for Propeller.
 
     SCV-Net and GA-Net, which the paper describes without numbers, are compared without a claim.
@@ -154,7 +173,7 @@ def _rival_changes(depth: bool) -> Iterator[tuple[str, str, str, str, tuple[_Mea
     for rival in ("densemapnet", "dispnet", "psmnet", "scvnet", "ganet_11"):
         claim = NETWORKS if rival in ("densemapnet", "dispnet") else NETWORKS_SHORT
         measures = (
-            _table_i_measure(rival, 0, "epe_px", "end-point error", depth),
+            _table_i_measure(rival, 0, _EPE, "end-point error", depth),
             _table_i_measure(rival, 1, "mae_filled", "MAE of the right view", depth),
         )
         yield f"the paper's network against {rival}", claim, rival, "fast_depth", measures
@@ -202,7 +221,9 @@ def claims_table(rows: Sequence[PaperRow], depth: bool = False) -> str:
         "| claim: reduction in percent | paper | here (95 % interval) | difference (points) | verdict |",
         "|---|---|---|---|---|",
     ]
-    for comparison in list_comparisons(depth):
+    exponents = {row.setting: row.exponent for row in rows if row.claim == ADJUSTMENT}
+    others = [setting for setting, exponent in exponents.items() if exponent not in (1.0, 1.5)]
+    for comparison in list_comparisons(depth, others):
         values = reductions_by_seed(rows, comparison)
         if not values:
             lines.append(f"| {comparison.text} | {comparison.paper} | not run | | |")
@@ -218,16 +239,17 @@ def claims_table(rows: Sequence[PaperRow], depth: bool = False) -> str:
 
 def propeller_table(rows: Sequence[PaperRow]) -> str:
     """Return a Markdown table of the networks on our propeller pairs, beside Table I's Propeller column."""
-    columns = "network", "steps", "EPE cm: paper", "here", "difference", "MAE of the right view: paper"
-    lines = [f"| {' | '.join((*columns, 'here', 'difference'))} |", "|---" * 8 + "|"]
+    columns = "network", "steps", "seeds", "EPE cm: paper", "here", "difference"
+    lines = [f"| {' | '.join((*columns, 'MAE of the right view: paper', *columns[-2:]))} |", "|---" * 9 + "|"]
     found = [row for row in rows if row.claim in (NETWORKS, NETWORKS_SHORT)]
     for network, steps in sorted({(row.model, row.steps) for row in found}, key=_table_i_order):
         chosen = [row for row in found if (row.model, row.steps) == (network, steps)]
-        cells = [NAMES[network], str(steps)]
+        cells = [NAMES[network], str(steps), str(len(chosen))]
         for index, measure in enumerate(("epe_cm", "mae_filled")):
             paper = TABLE_I[network][index][_PROPELLER] if network in TABLE_I else None
             here = _mean(chosen, measure)
             cells += [_format_or_dash(paper, ".2f"), f"{here:.2f}", _format_difference(here, paper, 2)]
+            cells[-2] += _format_deviation(chosen, measure, ".2f")
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
@@ -247,8 +269,7 @@ def settings_table(rows: Sequence[PaperRow], claim: str, depth: bool = False) ->
     ranked = sorted(chosen.items(), key=lambda item: (len(item[1]) == 1, _mean(item[1], "mae_filled")))
     for name, found in ranked:
         numbers = [f"{_mean(found, measure):{digits}}" for measure, (_, digits) in columns.items()]
-        if len(found) > 1:
-            numbers[0] += f" ± {np.std([getattr(row, first) for row in found], ddof=1):{columns[first][1]}}"
+        numbers[0] += _format_deviation(found, first, columns[first][1])
         lines.append(f"| {name} | {len(found)} | {' | '.join(numbers)} |")
     return "\n".join(lines)
 
@@ -285,6 +306,12 @@ def run_time_table(rows: Iterable[Mapping[str, str]]) -> str:
             f"| {_format_or_dash(paper, 'g')} | {_format_difference(onnx_relative, paper, 2)} |"
         )
     return "\n".join(lines)
+
+
+def _format_deviation(rows: Sequence[PaperRow], measure: str, digits: str) -> str:
+    """Return " ± " and the standard deviation over the seeds; an empty string for one seed."""
+    values = [getattr(row, measure) for row in rows]
+    return f" ± {np.std(values, ddof=1):{digits}}" if len(values) > 1 else ""
 
 
 def _format_or_dash(value: float | None, digits: str) -> str:

@@ -23,7 +23,7 @@ PROJECTED = "projection loss: end-point error"
 
 def row(claim, setting, seed=0, model="fast_depth", steps=600, **scores):
     found = dict.fromkeys(("prediction", "squared_error", "epe_px", "mae_sourced", "sourced_percent"), 1.0)
-    found |= {"epe_cm": math.nan}
+    found |= {"epe_cm": math.nan, "exponent": 1.5}
     found |= dict.fromkeys(("mae_filled", "psnr_db", "ssim", "minutes"), 1.0) | scores
     return PaperRow(
         claim=claim,
@@ -31,7 +31,6 @@ def row(claim, setting, seed=0, model="fast_depth", steps=600, **scores):
         seed=seed,
         model=model,
         loss="l2",
-        exponent=1.5,
         alpha_p=1.0,
         steps=steps,
         batch=4,
@@ -124,10 +123,32 @@ def test_losses_in_codes_of_two_exponents_decide_nothing():
         for setting, loss in (("p = 1", 2.0), ("p = 1.5", 1.0))
         for seed in range(3)
     ]
-    text = (
-        "depth adjustment, p = 1.5 against 1: validation loss, each in its own code (smaller by construction)"
-    )
+    text = "depth adjustment, p = 1.5 against 1: validation loss, each in its own code (not comparable)"
     assert line_of(claims_table(rows), text) == ["about 15 %", "50 (50 to 50)", "+35", "not a fair test"]
+
+
+def test_every_other_exponent_is_compared_with_none_without_a_claim():
+    errors = {
+        "p = 1": (1.0, 4.0),
+        "p = 2": (2.0, 3.0),
+        "p = 2.47 (fitted)": (2.47, 2.0),
+        "p = 1.5": (1.5, 3.0),
+    }
+    rows = [
+        row(ADJUSTMENT, setting, exponent=exponent, epe_cm=10 * px, epe_px=px, mae_filled=px)
+        for setting, (exponent, px) in errors.items()
+    ]
+    # 1 - 2 / 4.
+    for measure in ("end-point error", "end-point error in px", "MAE of the right view"):
+        text = f"depth adjustment, p = 2.47 (fitted) against 1: {measure}"
+        cells = line_of(claims_table(rows, depth=True), text)
+        assert cells == ["-", "50 (one seed)", "", "one seed: no verdict"]
+    of_pixels = claims_table(rows)
+    assert "p = 2.47 (fitted) against 1: end-point error |" in of_pixels
+    assert "in px" not in of_pixels
+    # The fit may end at its bound, 1.
+    rows = [row(ADJUSTMENT, setting, exponent=1.0) for setting in ("p = 1", "p = 1 (fitted)")]
+    assert "p = 1 (fitted)" not in claims_table(rows)
 
 
 @pytest.mark.parametrize(
@@ -198,7 +219,9 @@ def test_the_settings_of_a_claim_are_ranked_by_the_mae_of_the_filled_view():
 
 def test_depth_is_claimed_of_the_error_in_cm_and_of_propeller_alone():
     found = {comparison.text: comparison for comparison in list_comparisons(depth=True)}
-    assert found.keys() == COMPARISONS.keys()
+    in_px = "depth adjustment, p = 1.5 against 1: end-point error in px"
+    assert found.keys() == COMPARISONS.keys() | {in_px}
+    assert found.pop(in_px).measure == "epe_px"
     assert {one.measure for one in found.values()} == {"prediction", "squared_error", "epe_cm", "mae_filled"}
     # 1 - 2.32 / 8.67, and 1 - 37.31 / 41.22.
     parent = found["the paper's network against densemapnet: end-point error"]
@@ -226,13 +249,14 @@ def test_networks_stand_beside_the_papers_propeller():
     ]
     lines = propeller_table(rows).splitlines()
     assert lines[2:] == [
-        "| PSMNet | 150 | 2.38 | 1.38 | -1.00 | 41.22 | 41.22 | +0.00 |",
-        "| SCV-Net | 150 | - | 2.50 |  | - | 43.00 |  |",
-        "| GA-Net-11 | 150 | - | 1.50 |  | - | 42.00 |  |",
-        "| the paper's network | 150 | 2.32 | 60.00 | +57.68 | 37.31 | 40.00 | +2.69 |",
-        "| the paper's network | 600 | 2.32 | 45.00 | +42.68 | 37.31 | 31.00 | -6.31 |",
+        "| PSMNet | 150 | 1 | 2.38 | 1.38 | -1.00 | 41.22 | 41.22 | +0.00 |",
+        "| SCV-Net | 150 | 1 | - | 2.50 |  | - | 43.00 |  |",
+        "| GA-Net-11 | 150 | 1 | - | 1.50 |  | - | 42.00 |  |",
+        "| the paper's network | 150 | 1 | 2.32 | 60.00 | +57.68 | 37.31 | 40.00 | +2.69 |",
+        # The deviation of 40 and 50 is 10 / sqrt(2), that of 30 and 32 is sqrt(2).
+        "| the paper's network | 600 | 2 | 2.32 | 45.00 ± 7.07 | +42.68 | 37.31 | 31.00 ± 1.41 | -6.31 |",
     ]
-    assert {line.count("|") for line in lines} == {9}
+    assert {line.count("|") for line in lines} == {10}
 
 
 def test_the_settings_of_depth_have_their_errors_in_cm_first():
