@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Float32, Int32, UInt8
 
 from stereoweave.matching.exposure import match_exposure, recolour
 from stereoweave.matching.left_right_check import at_match, find_occluded
+from stereoweave.matching.step_penalties import penalise_large_steps
 from stereoweave.stereo import Estimate, StereoPair, check_fits
 from stereoweave.system.steps import step
 from stereoweave.system.threads import in_bands, thread_count
@@ -32,9 +33,6 @@ _CANDIDATES_MULTIPLE = 16
 # this many rows on each side.
 _CANDIDATES_AT_ONCE = 100_000_000
 _OVERLAP_PX = 64  # two tiles
-# Penalty for a large disparity step: greatest between equal grey levels, halved at this grey difference.
-_LARGEST_STEP, _LEAST_LARGE_STEP = 125, 30
-_HALVING_LEVELS = 30
 # Disparities are searched up to this far from those that are not certain: 36 % of the left pixels of real
 # pairs. New views gain 0.1 dB from a search everywhere, and lose 0.3 dB without the pixels around.
 _REACH_PX = 4
@@ -168,11 +166,11 @@ def _match_view(view: _View, first_px: int, count: int, threads: int) -> Float32
     """Match a view, a large one in strips of rows."""
     height, width = view.searched.shape
     found_px = np.empty((height, width), np.float32)
-    step = max(_CANDIDATES_AT_ONCE // (width * count), 4 * _OVERLAP_PX) - 2 * _OVERLAP_PX
-    for top in range(0, height, step):
-        rows = slice(max(top - _OVERLAP_PX, 0), min(top + step + _OVERLAP_PX, height))
+    settled = max(_CANDIDATES_AT_ONCE // (width * count), 4 * _OVERLAP_PX) - 2 * _OVERLAP_PX
+    for top in range(0, height, settled):
+        rows = slice(max(top - _OVERLAP_PX, 0), min(top + settled + _OVERLAP_PX, height))
         strip_px = _match_strip(view.take(rows), first_px, count, threads)
-        found_px[top : top + step] = strip_px[top - rows.start :][:step]
+        found_px[top : top + settled] = strip_px[top - rows.start :][:settled]
     return found_px
 
 
@@ -184,7 +182,8 @@ def _match_strip(strip: _View, first_px: int, count: int, threads: int) -> Float
     height, width = own.grey.shape
     search, size = _choose_candidates(strip, count)
     costs, sums = np.empty(size, np.uint8), np.empty(size, np.uint16)
-    steps_along, steps_down = (_large_steps(own.grey, axis) for axis in (1, 0))
+    before = (own.grey.take([0, *range(own.grey.shape[axis] - 1)], axis) for axis in (1, 0))
+    steps_along, steps_down = (penalise_large_steps(own.grey, grey) for grey in before)
     found_px = first_px + own.prior / np.float32(kernels.SUBSTEPS)
 
     def match(first: int, last: int) -> None:
@@ -331,10 +330,3 @@ def right_confidence(estimate: Estimate) -> Float32[np.ndarray, "h w"]:
     confidence, _ = at_match(np.asarray(estimate.confidence, np.float32), estimate.right_disparity_px, 1)
     agreed = inside & (np.abs(seen_px - estimate.right_disparity_px) <= _SAME_PX)
     return np.where(agreed, confidence, np.float32(_DOUBTED) * confidence)
-
-
-def _large_steps(grey: UInt8[np.ndarray, "h w"], axis: int) -> UInt8[np.ndarray, "h w"]:
-    """Return the penalty for a large step from the previous pixel to each pixel, lower at grey edges."""
-    before = grey.take([0, *range(grey.shape[axis] - 1)], axis)
-    by_difference = _LARGEST_STEP / (1 + np.arange(256, dtype=np.float32) / _HALVING_LEVELS)
-    return cv2.LUT(cv2.absdiff(grey, before), np.maximum(by_difference, _LEAST_LARGE_STEP).astype(np.uint8))

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int16, Shaped, UInt8, UInt16, UInt32
 
 from stereoweave.matching.left_right_check import find_occluded
+from stereoweave.matching.step_penalties import penalise_large_steps
 from stereoweave.stereo import Estimate
 from stereoweave.system.steps import step
 from stereoweave.system.threads import in_bands, thread_count
@@ -31,9 +32,6 @@ _EDGE_PX = 1.5
 # Cost per px of a candidate's distance to its surface. Only distances from _FREE_PX to _FARTHEST_PX count,
 # because disparities of the smaller images are accurate to about half a pixel of those images.
 _PULL, _FREE_PX, _FARTHEST_PX = 2, 1, 8
-# Penalty for a large disparity step: greatest between equal grey levels, halved at this grey difference.
-_LARGEST_STEP, _LEAST_LARGE_STEP = 125, 30
-_HALVING_LEVELS = 30
 # A prior that is off by at most this is corrected by the mean difference in a window of this size.
 _FOLLOWED_PX = 2.0
 _MEAN_PX = 9
@@ -127,13 +125,13 @@ class _StripView:
     def steps_along(self, rows: slice) -> UInt16[np.ndarray, "h w1"]:
         """Return the penalty for a large step from the previous column to each column."""
         grey = self.grey[rows]
-        return np.pad(_large_steps(grey[:, 1:], grey[:, :-1]), ((0, 0), (1, 1)))
+        return np.pad(penalise_large_steps(grey[:, 1:], grey[:, :-1]), ((0, 0), (1, 1))).astype(np.uint16)
 
     def steps_down(self, rows: slice) -> UInt16[np.ndarray, "h1 w"]:
         """Return the penalty for a large step before each row and after the last row."""
         grey = self.grey[max(rows.start - 1, 0) : rows.stop + 1]
         ends = rows.start == 0, rows.stop == len(self.grey)
-        return np.pad(_large_steps(grey[1:], grey[:-1]), (ends, (0, 0)))
+        return np.pad(penalise_large_steps(grey[1:], grey[:-1]), (ends, (0, 0))).astype(np.uint16)
 
 
 def enlarge(
@@ -378,14 +376,6 @@ def _pull() -> UInt8[np.ndarray, " d"]:
 def _places(size: int, smaller: int) -> Int[np.ndarray, " n"]:
     """Return, for each of `size` pixels, the index of the smaller image's pixel that covers it."""
     return np.minimum(((np.arange(size) + 0.5) * smaller / size).astype(int), smaller - 1)
-
-
-def _large_steps(
-    grey: UInt8[np.ndarray, "h w"], before: UInt8[np.ndarray, "h w"]
-) -> UInt16[np.ndarray, "h w"]:
-    """Return the penalty for a large step between two pixels; the penalty is lower at grey edges."""
-    costs = _LARGEST_STEP / (1 + cv2.absdiff(grey, before).astype(np.float32) / _HALVING_LEVELS)
-    return np.maximum(costs, _LEAST_LARGE_STEP).astype(np.uint16)
 
 
 def _resize(values: Float[np.ndarray, "h w"], shape: tuple[int, int]) -> Float32[np.ndarray, "h2 w2"]:
