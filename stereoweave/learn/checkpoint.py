@@ -29,6 +29,7 @@ class Checkpoint:
         commit: Commit of the code that trained the network.
         hours: Hours of training so far, over all restarts and including the runs that this run descends from.
         origin: Recipe, step and commit of each checkpoint that the run descends from, oldest first.
+        skipped: Steps of the run that were skipped, because the loss or the gradient was not finite.
     """
 
     recipe: Recipe
@@ -41,6 +42,7 @@ class Checkpoint:
     commit: str
     hours: float
     origin: tuple[dict[str, Any], ...] = ()
+    skipped: tuple[int, ...] = ()
 
     def as_origin(self) -> tuple[dict[str, Any], ...]:
         """Return the origin of a run that starts from this checkpoint."""
@@ -181,8 +183,9 @@ def load(path: Path) -> Checkpoint:
         # Its texts advise programmers.
         found = reason(error) if isinstance(error, OSError | EOFError) else _NOT_ONE
         raise FormatError(f"{path}: expected a checkpoint of `stereoweave train`, found {found}") from error
-    # Older checkpoints have no origin.
-    if not isinstance(values, dict) or {*values, "origin"} != {field.name for field in fields(Checkpoint)}:
+    # Older checkpoints lack these.
+    every = {field.name for field in fields(Checkpoint)}
+    if not isinstance(values, dict) or {*values, "origin", "skipped"} != every:
         raise FormatError(
             f"{path}: expected a checkpoint of `stereoweave train`, found another kind of PyTorch file"
         )

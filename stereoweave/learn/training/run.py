@@ -47,7 +47,7 @@ class TrainingRun(ModelState):
         self.compute = StepGraph(self._compute) if recorded else self._compute
         self.began_s = self.saved_s = time.monotonic()
         self.scores = start.scores
-        self.skipped: list[int] = []
+        self.skipped = list(start.skipped)
 
     def step(self, step: int, batch: dict[str, torch.Tensor], batches: Batches) -> float:
         """Take one optimiser step. Returns the loss.
@@ -131,6 +131,7 @@ class TrainingRun(ModelState):
             random_state=torch.get_rng_state(),
             scores=scores,
             hours=self.start.hours + (time.monotonic() - self.began_s) / 3600,
+            skipped=tuple(self.skipped),
         )
         checkpoint.save(state, path)
 

@@ -281,6 +281,22 @@ def test_gradients_that_are_not_finite_never_reach_the_weights_and_the_second_st
     assert not run.optimiser.state_dict()["state"]
 
 
+def test_a_resumed_run_remembers_the_steps_that_it_skipped(tmp_path, logger):
+    recipe, batches = recipe_of("fast_depth"), Batches(recipe_of("fast_depth"), CAMERA_PAIRS)
+
+    def resume():
+        run = TrainingRun(recipe, load_start(recipe, tmp_path / "last.pt"), make_fabric(logger))
+        run.network.head.to_code.bias.register_hook(lambda gradient: gradient * torch.inf)
+        return run
+
+    before = resume()
+    before.step(7, batches[7], batches)
+    before.save(8, {}, tmp_path / "last.pt")
+    assert complaint(resume().step, 506, batches[506], batches).endswith(
+        "; step 7 was skipped for the same reason"
+    )
+
+
 def test_a_recipe_for_an_unknown_network_is_refused(tmp_path):
     file = write(replace(RECIPE, model="spider"), tmp_path / "spider.toml")
     with pytest.raises(FormatError, match=r"tiny: model = 'spider', expected one of weave_small"):
