@@ -176,16 +176,17 @@ class _TimedLoop:
         return batch
 
     def _measure_step_s(self, batch: dict[str, torch.Tensor]) -> float:
-        """Return the mean time of a few steps at a learning rate of 0, after one warm-up step."""
-        for step in range(1 + _TRIED_STEPS):
-            if step == 1:
-                began_s = time.monotonic()
-            if math.isnan(self.run.finish(self.run.begin(batch), 0.0)):
-                raise StereoweaveError(
-                    "the first batch: expected a finite loss and gradient, found NaN or infinity; "
-                    "start from other weights"
-                )
-        return (time.monotonic() - began_s) / _TRIED_STEPS
+        """Return the mean time of a few steps, after one warm-up step. The steps are undone."""
+        with self.run.undone():
+            for step in range(1 + _TRIED_STEPS):
+                if step == 1:
+                    began_s = time.monotonic()
+                if math.isnan(self.run.finish(self.run.begin(batch), 0.0)):
+                    raise StereoweaveError(
+                        "the first batch: expected a finite loss and gradient, found NaN or infinity; "
+                        "start from other weights"
+                    )
+            return (time.monotonic() - began_s) / _TRIED_STEPS
 
     def _count(self, pairs: int, loss: float) -> None:
         before = self.progress

@@ -2,6 +2,9 @@
 
 import json
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from copy import deepcopy
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -135,6 +138,15 @@ class TimedRun(ModelState):
             value = float(self._loss(batch, bfloat16))
         self._restore_statistics()
         return value
+
+    @contextmanager
+    def undone(self) -> Iterator[None]:
+        """Undo all steps of the block at its end: the optimiser, its moments and all statistics too."""
+        parts: tuple[Any, ...] = self.network, self.averaged, self.optimiser
+        states = [deepcopy(part.state_dict()) for part in parts]
+        yield
+        for part, state in zip(parts, states, strict=True):
+            part.load_state_dict(state)
 
     def begin(self, batch: dict[str, Tensor]) -> Tensor:
         """Compute a step's gradient. Returns the step's loss; on a GPU, both are computed asynchronously."""

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 
@@ -144,6 +145,18 @@ def test_a_step_that_is_not_finite_changes_nothing():
     )
     assert all(value.isfinite().all() for value in run.network.state_dict().values())
     assert math.isfinite(step(run))
+
+
+def test_undone_steps_leave_weights_statistics_and_moments_as_they_were():
+    run = run_of()
+    step(run)
+    parts = run.network, run.averaged, run.optimiser
+    before = [deepcopy(part.state_dict()) for part in parts]
+    with run.undone():
+        step(run)
+        assert not torch.equal(run.network.to_match.weight, before[0]["to_match.weight"])
+    for part, values in zip(parts, before, strict=True):
+        torch.testing.assert_close(part.state_dict(), values, rtol=0, atol=0)
 
 
 def test_weights_that_are_not_finite_are_not_written(tmp_path):
