@@ -109,7 +109,7 @@ def test_on_real_pairs_the_network_is_as_good_as_promised(testdata, name, refine
 
 
 @pytest.mark.testdata
-# The targets are 29.2, 28.0 and 35.0 dB (lab notebook, 2026-11-21).
+# Wanted are 29.2, 29.0 and 35.0 dB.
 @pytest.mark.parametrize(
     ("name", "scene_name", "least_db"),
     [

@@ -72,7 +72,7 @@ def quantise(source: Path, out: Path) -> dict[str, Any]:
 def select_int8_nodes(graph: onnx.ModelProto) -> list[str]:
     """Return the names of the nodes to compute in 8 bits.
 
-    They are all convolutions except those of the refinement, the nodes between these convolutions,
+    They are all convolutions except those of the refinements, the nodes between these convolutions,
     and the ReLUs after them. Disparities, correlations and their inputs stay in float32, because 8 bits would
     round a disparity to whole pixels.
     """
