@@ -157,6 +157,21 @@ def test_parallel_cameras_get_no_negative_disparities(rng):
     assert found.right_disparity_px.min() >= 0
 
 
+def test_confidence_rises_to_0_7_where_both_views_agree_on_texture(rng):
+    size = (64, 160)
+    left, right, _ = photographs(rng, np.full(size, FAR_PX), size)
+    plain = slice(50, 110)
+    left[:, plain] = right[:, plain.start - FAR_PX : plain.stop - FAR_PX] = 100
+    given = estimate_of(np.full(size, FAR_PX), np.full(size, FAR_PX))
+    given.confidence[:, 20:30] = 0.9
+    refined = refine(left, right, given)
+    np.testing.assert_array_equal(refined.confidence[:, :FAR_PX], np.float32(0.2))  # only one view sees it
+    np.testing.assert_array_equal(refined.confidence[:, 8:20], np.float32(0.7))
+    np.testing.assert_array_equal(refined.confidence[:, 20:30], np.float32(0.9))
+    np.testing.assert_array_equal(refined.confidence[:, 55:105], np.float32(0.2))
+    np.testing.assert_array_equal(refined.confidence[:, 115:], np.float32(0.7))
+
+
 def random_pair(rng):
     """Return random images and a random estimate, which exercise every branch; a block in it is certain."""
     left, right = (cv2.blur(rng.integers(0, 256, (24, 50, 3), np.uint8), (3, 3)) for _ in range(2))
