@@ -48,8 +48,8 @@ _SAME_PX = 1.0
 # last refinement (decision 0035). None then reaches CERTAIN, so any of them that is searched may be replaced.
 _COARSE = np.float32(0.7)
 # Least confidence where the refined views agree on a textured surface. Of disparities of lower confidence, 60
-# to 88 % are there within 1 px of the truth (rendered pairs); on plain walls, on which false matches agree too,
-# 20 to 50 %.
+# to 88 % are there within 1 px of the truth (rendered pairs). On plain walls 20 to 50 % are, because false
+# matches agree there too.
 _CONFIRMED = np.float32(0.7)
 _TEXTURE_PX, _TEXTURE_LEVELS = 5, 8
 _MOST_THREADS = 4
