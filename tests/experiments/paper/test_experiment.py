@@ -474,10 +474,10 @@ def test_the_tables_of_depth_stand_beside_the_papers_propeller(on_disk):
     assert "Ground truth beyond 8 m is unknown" in text
     assert "transfer" not in text.lower()
     table = text.split("## Table I, Propeller\n\n")[1].split("\n\n")[0].splitlines()[2:]
-    assert [line.split(" | ")[:3] for line in table] == [
-        ["| DenseMapNet", "4", "8.67"],
-        ["| PSMNet", "1", "2.38"],
-        ["| the paper's network", "4", "2.32"],
+    assert [line.split(" | ")[:4] for line in table] == [
+        ["| DenseMapNet", "4", "1", "8.67"],
+        ["| PSMNet", "1", "1", "2.38"],
+        ["| the paper's network", "4", "1", "2.32"],
     ]
     # Without disparity, everything is at 8 m: three quarters of the pixels are off by 2 m, the box by 6 m.
     assert [line for line in text.splitlines() if line.startswith("| no warping | 300.0 | 6.00 | ")]
