@@ -92,7 +92,7 @@ def found_raw(testdata, name):
 
 @pytest.mark.testdata
 @pytest.mark.parametrize(
-    ("name", "refined", "most"),
+    ("name", "refined", "most"),  # of EPE, bad-1, bad-2, D1 and flying pixels
     [
         ("small", False, (1.2, 18.0, 11.6, 8.1, 13.0)),
         ("small", True, (0.9, 13.6, 8.2, 5.4, 5.2)),
@@ -111,7 +111,7 @@ def test_on_real_pairs_the_network_is_as_good_as_promised(testdata, name, refine
 
 
 @pytest.mark.testdata
-# Wanted are 29.2, 29.0 and 35.0 dB.
+# The aims were 29.2, 29.0 and 35.0 dB.
 @pytest.mark.parametrize(
     ("name", "scene_name", "least_db"),
     [

@@ -159,7 +159,7 @@ def list_comparisons(depth: bool = False, exponents: Iterable[str] = ()) -> Iter
 
 def _list_exponents(depth: bool, others: Iterable[str]) -> Iterator[_Change]:
     """Yield the depth adjustments, as rows of _CHANGES."""
-    # A code with a larger exponent is finer where depths are small, so errors of near pixels count as well.
+    # A code with a larger exponent is finer where depths are small, which an error in cm hardly shows.
     in_px = (_IN_PX,) if depth else ()
     for setting, measures in (("p = 1.5", _ADJUSTMENT), *((other, _OTHER_EXPONENT) for other in others)):
         yield f"depth adjustment, {setting} against 1", ADJUSTMENT, "p = 1", setting, (*measures, *in_px)
@@ -239,8 +239,11 @@ def claims_table(rows: Sequence[PaperRow], depth: bool = False) -> str:
 
 def propeller_table(rows: Sequence[PaperRow]) -> str:
     """Return a Markdown table of the networks on our propeller pairs, beside Table I's Propeller column."""
-    columns = "network", "steps", "seeds", "EPE cm: paper", "here", "difference"
-    lines = [f"| {' | '.join((*columns, 'MAE of the right view: paper', *columns[-2:]))} |", "|---" * 9 + "|"]
+    lines = [
+        "| network | steps | seeds | EPE cm: paper | here | difference "
+        "| MAE of the right view: paper | here | difference |",
+        "|---" * 9 + "|",
+    ]
     found = [row for row in rows if row.claim in (NETWORKS, NETWORKS_SHORT)]
     for network, steps in sorted({(row.model, row.steps) for row in found}, key=_table_i_order):
         chosen = [row for row in found if (row.model, row.steps) == (network, steps)]

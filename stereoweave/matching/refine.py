@@ -86,8 +86,8 @@ def refine(
     """Correct the disparities of both views by semi-global matching at full resolution.
 
     The network's disparity is kept where matching confirms it to within 1 px (the network is then more
-    precise), where the left view's confidence is high, and where the two views disagree. The confidence rises
-    where the refined views agree. Different exposures are equalised first.
+    precise), where the left view's confidence is high, and where the two views disagree. The confidence is at
+    least 0.7 where the refined views agree on texture, but 0 stays 0. Different exposures are equalised first.
 
     Args:
         left: Left image, uint8 RGB [H, W, 3].
@@ -108,7 +108,9 @@ def refine(
         estimate.right_disparity_px, right_found_px, found_px, _COARSE * right_trust, 1
     )
     disagreement_px, inside = measure_disagreement(disparity_px, right_disparity_px)
-    confirmed = inside & (np.abs(disagreement_px) <= _SAME_PX) & _find_texture(left)
+    agreed = inside & (np.abs(disagreement_px) <= _SAME_PX)
+    # A confidence of 0 marks pixels without content or texture.
+    confirmed = agreed & (estimate.confidence > 0) & _find_texture(left)
     return Estimate(
         disparity_px=disparity_px,
         right_disparity_px=right_disparity_px,
@@ -173,11 +175,11 @@ def _match_view(view: _View, first_px: int, count: int, threads: int) -> Float32
     """Match a view, a large one in strips of rows."""
     height, width = view.searched.shape
     found_px = np.empty((height, width), np.float32)
-    settled = max(_CANDIDATES_AT_ONCE // (width * count), 4 * _OVERLAP_PX) - 2 * _OVERLAP_PX
-    for top in range(0, height, settled):
-        rows = slice(max(top - _OVERLAP_PX, 0), min(top + settled + _OVERLAP_PX, height))
+    kept_rows = max(_CANDIDATES_AT_ONCE // (width * count), 4 * _OVERLAP_PX) - 2 * _OVERLAP_PX
+    for top in range(0, height, kept_rows):
+        rows = slice(max(top - _OVERLAP_PX, 0), min(top + kept_rows + _OVERLAP_PX, height))
         strip_px = _match_strip(view.take(rows), first_px, count, threads)
-        found_px[top : top + settled] = strip_px[top - rows.start :][:settled]
+        found_px[top : top + kept_rows] = strip_px[top - rows.start :][:kept_rows]
     return found_px
 
 

@@ -154,7 +154,7 @@ def test_two_visitors_work_at_once_and_cancelling_ends_one_job(server, browser, 
         patient.page.click("#find")
         patient.page.locator("#status").get_by_text("matching 2560×1920 px").wait_for()
         worker = worker_at_work(pid)
-        worker.suspend()  # its work takes until it is killed
+        worker.suspend()  # so that it is still at work when it is cancelled
         quick.give(**pair)
         quick.page.get_by_label("fast").check()
         assert f"{WIDTH}×{HEIGHT} px, matched in" in quick.find()

@@ -164,12 +164,14 @@ def test_confidence_rises_to_0_7_where_both_views_agree_on_texture(rng):
     left[:, plain] = right[:, plain.start - FAR_PX : plain.stop - FAR_PX] = 100
     given = estimate_of(np.full(size, FAR_PX), np.full(size, FAR_PX))
     given.confidence[:, 20:30] = 0.9
+    given.confidence[:, 130:140] = 0
     refined = refine(left, right, given)
     np.testing.assert_array_equal(refined.confidence[:, :FAR_PX], np.float32(0.2))  # only one view sees it
     np.testing.assert_array_equal(refined.confidence[:, 8:20], np.float32(0.7))
     np.testing.assert_array_equal(refined.confidence[:, 20:30], np.float32(0.9))
     np.testing.assert_array_equal(refined.confidence[:, 55:105], np.float32(0.2))
-    np.testing.assert_array_equal(refined.confidence[:, 115:], np.float32(0.7))
+    np.testing.assert_array_equal(refined.confidence[:, 115:130], np.float32(0.7))
+    np.testing.assert_array_equal(refined.confidence[:, 130:140], np.float32(0))  # without content
 
 
 def random_pair(rng):
