@@ -87,7 +87,8 @@ def refine(
 
     The network's disparity is kept where matching confirms it to within 1 px (the network is then more
     precise), where the left view's confidence is high, and where the two views disagree. The confidence is at
-    least 0.7 where the refined views agree on texture, but 0 stays 0. Different exposures are equalised first.
+    least 0.7 where the refined views agree on texture, but 0 stays 0. Different exposures are equalised
+    first.
 
     Args:
         left: Left image, uint8 RGB [H, W, 3].

@@ -14,5 +14,5 @@ _PENALTIES = np.maximum(_BY_DIFFERENCE, _LEAST).astype(np.uint8)
 def penalise_large_steps(
     grey: UInt8[np.ndarray, "h w"], before: UInt8[np.ndarray, "h w"]
 ) -> UInt8[np.ndarray, "h w"]:
-    """Return the penalty for a large step from the pixel before to each pixel, 30..125; it is lower at grey edges."""
+    """Return each pixel's penalty for a large step from the one before, 30..125; lower at grey edges."""
     return cv2.LUT(cv2.absdiff(grey, before), _PENALTIES)

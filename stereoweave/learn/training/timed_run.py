@@ -141,7 +141,7 @@ class TimedRun(ModelState):
 
     @contextmanager
     def undone(self) -> Iterator[None]:
-        """Undo all steps of the block at its end: weights, average, statistics and the optimiser's moments."""
+        """Undo all steps of the block at its end: weights, average, statistics and optimiser."""
         parts: tuple[Any, ...] = self.network, self.averaged, self.optimiser
         states = [deepcopy(part.state_dict()) for part in parts]
         yield
