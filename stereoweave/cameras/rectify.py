@@ -41,7 +41,8 @@ def rectify(pair: StereoPair, rig: Rig) -> Rectified:
 
     Raises:
         FormatError: The rig is for pictures of a different size.
-        StereoweaveError: The right camera is not to the right of the left one.
+        StereoweaveError: The right camera is not to the right of the left one, or the cameras look in such
+            different directions that no common view is left.
     """
     rig.check_size(pair)
     _check_side_by_side(rig)
@@ -54,6 +55,11 @@ def rectify(pair: StereoPair, rig: Rig) -> Rectified:
         camera = _choose_camera(rig, turns, pair_size_px(pair))
     left, left_seen = _rectify_view(pair.left, rig.left, turns[0], camera)
     right, right_seen = _rectify_view(pair.right, rig.right, turns[1], camera)
+    if not (left_seen.any() and right_seen.any()):
+        raise StereoweaveError(
+            f"{rig.name}: expected two cameras with a common view, found that "
+            f"{'the right' if left_seen.any() else 'the left'} one does not see it; check the rotation"
+        )
     rectified = StereoPair(left=left, right=right, camera=camera, left_seen=left_seen, right_seen=right_seen)
     return Rectified(pair=rectified, notes=(*rig.notes, _summarize(rig, turns, rectified)))
 

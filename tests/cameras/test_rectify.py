@@ -195,6 +195,20 @@ def test_cameras_that_look_different_ways_are_refused(rng, degrees):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(("degrees", "focal_px"), [(40, 2000), (70, 600)])
+def test_cameras_without_a_common_view_are_refused(rng, degrees, focal_px):
+    lens = Optics(
+        matrix=np.array([[focal_px, 0, 320], [0, focal_px, 240], [0, 0, 1.0]]), distortion=np.zeros(0)
+    )
+    rotation = turned(0, degrees, 0)
+    apart = replace(
+        flat_rig(), left=lens, right=lens, rotation=rotation, translation_m=-rotation @ [0.1, 0, 0]
+    )
+    with pytest.raises(StereoweaveError, match="expected two cameras with a common view") as caught:
+        rectify.rectify(noise(rng), apart)
+    assert "\n" not in str(caught.value)
+
+
 def test_a_lens_whose_model_divides_by_0_far_outside_of_the_picture_is_rectified(rng):
     """The denominator 1 + k4 r^2 of OpenCV's rational model is 0 at r = 10; the picture ends at r = 0.8."""
     lens = Optics(matrix=flat_rig().left.matrix, distortion=np.array([0, 0, 0, 0, 0, -0.01, 0, 0]))
