@@ -87,6 +87,8 @@ def _average_beside(canvas, y, column, inwards):
 
     The mean is taken over two columns and three rows, with row y counted twice.
     """
+    # Rounds a mean that is stored in one byte; levels of float32 already have the half.
+    half = 0.5 if canvas.image.itemsize == 1 else 0.0
     height, width = canvas.pure.shape
     here_px = canvas.surface_px[y, column]
     red = green = blue = total = 0.0
@@ -98,7 +100,7 @@ def _average_beside(canvas, y, column, inwards):
                 green += weight * canvas.image[row, x, 1]
                 blue += weight * canvas.image[row, x, 2]
                 total += weight
-    return red / total + 0.5, green / total + 0.5, blue / total + 0.5
+    return red / total + half, green / total + half, blue / total + half
 
 
 @compiled

@@ -38,6 +38,21 @@ def test_a_fine_view_of_whole_levels_is_the_rounded_one(position):
     assert np.quantile(np.abs(off_levels), 0.9) <= 0.51
 
 
+def test_filled_holes_of_an_even_scene_keep_its_level():
+    # An object 9 px nearer than the wall; beyond the right camera, neither picture shows 3 columns beside it.
+    px = np.full((2, 24, 64), 3.0, np.float32)
+    px[0, :, 30:40], px[1, :, 18:28] = 12, 12
+    seen_by_one = np.zeros((24, 64), bool)
+    estimate = Estimate(
+        disparity_px=px[0], right_disparity_px=px[1], confidence=np.ones_like(px[0]), occluded=seen_by_one
+    )
+    fine = np.full((24, 64, 3), 100.25, np.float32)
+    pair = StereoPair(left=fine.astype(np.uint8), right=fine.astype(np.uint8))
+    assert not Renderer(pair, estimate, threads=1).view(1.4).drawn.all()
+    view = Renderer(pair, estimate, threads=1, fine=(fine, fine)).fine_view(1.4)
+    np.testing.assert_allclose(view, 100.25, atol=1e-4)
+
+
 @pytest.mark.parametrize("name", [name for name, layout in LAYOUTS.items() if layout.join])
 def test_fine_layouts_are_arranged_as_the_others(name):
     left, right, renderer = wall()
