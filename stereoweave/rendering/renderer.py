@@ -186,8 +186,8 @@ def render(  # noqa: PLR0913 - the options of one view
         convergence_px: Disparity of the plane that stays in place in all views.
         up: Distance above the line through the cameras, in baselines; from -1 to 1.
         forward: Distance from that line towards the scene, in baselines; from -1 to 1.
-        camera: Camera whose focal length, principal point and doffs `up` and `forward` use. Default: a camera
-            whose focal length is the image width.
+        camera: Camera whose focal length, principal point and doffs `up` and `forward` use. Default: the
+            camera of the estimate's pair, or one whose focal length is the image width.
 
     Returns:
         The view, which has the same size as the images; `drawn` is False in filled holes. The view from
@@ -198,7 +198,7 @@ def render(  # noqa: PLR0913 - the options of one view
     """
     check_kind("estimate", estimate, Estimate)
     given = estimate.pair or StereoPair(left=as_rgb(left, "left"), right=as_rgb(right, "right"))
-    pair = replace(given, camera=camera)
+    pair = replace(given, camera=given.camera if camera is None else camera)
     renderer = Renderer(pair, estimate, strength=strength, convergence_px=convergence_px, threads=threads)
     return renderer.view(position, up=up, forward=forward)
 

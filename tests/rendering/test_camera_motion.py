@@ -1,10 +1,12 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from plain_moving import plain_move
 
 from stereoweave.rendering.camera_motion_kernels import move
 from stereoweave.rendering.canvas_kernels import Canvas, empty_canvas
-from stereoweave.rendering.renderer import Renderer
+from stereoweave.rendering.renderer import Renderer, render
 from stereoweave.stereo import Estimate, StereoCamera, StereoPair
 
 
@@ -98,6 +100,14 @@ def test_without_a_camera_the_focal_length_is_the_width_and_the_principal_point_
     view, expected = (renderer.view(0.5, up=0.25, forward=0.5) for renderer in (assumed, known))
     np.testing.assert_array_equal(view.image, expected.image)
     np.testing.assert_array_equal(view.drawn, expected.drawn)
+
+
+def test_an_estimates_pair_is_rendered_with_its_camera(rng):
+    camera = StereoCamera(focal_px=80.0, baseline_m=0.1, cx_px=45.0, cy_px=30.0, doffs_px=4.0)
+    renderer = flat(rng, 8, camera)
+    found = replace(renderer.estimate, pair=renderer.pair)
+    view = render(renderer.pair.left, renderer.pair.right, found, 0.5, up=0.5)
+    np.testing.assert_array_equal(view.image, renderer.view(0.5, up=0.5).image)
 
 
 def test_without_a_camera_the_farthest_surface_of_a_converged_pair_is_infinitely_far(rng):
