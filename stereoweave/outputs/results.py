@@ -6,9 +6,7 @@ stored as infinity in PFM, NPY and TIFF, and as 0 in PNG.
 """
 
 import hashlib
-import tempfile
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +18,7 @@ from stereoweave.cameras.calibration_files import read_calibration_bytes
 from stereoweave.cameras.spherical import SphereRequest
 from stereoweave.errors import NameOf, Note, StereoweaveError, keyword
 from stereoweave.io.colormap import colour_disparity, find_colour_range_px, grey_confidence
-from stereoweave.io.files import make_folder, make_parent_folder, reading
+from stereoweave.io.files import reading
 from stereoweave.io.images import write_image
 from stereoweave.io.maps import (
     RangeError,
@@ -32,7 +30,7 @@ from stereoweave.io.maps import (
     write_pfm,
     write_scaled_disparity_png,
 )
-from stereoweave.io.output_lock import lock_output
+from stereoweave.io.results_folder import replacing_together
 from stereoweave.matching.backend import Backend
 from stereoweave.matching.options import MatchOptions
 from stereoweave.outputs.point_cloud import (
@@ -137,7 +135,7 @@ def make_depth(pictures: Sequence[Path], out: Path, job: DepthJob) -> tuple[Summ
     files, left_out = _choose_files(job, prepared)
     if REPORT in files:
         compile_ahead(rehearse_drawing, rehearse_filling)
-    with _write_together(out) as folder:
+    with replacing_together(out, tuple(FILES)) as folder:
         result = run(prepared, matcher, job.options)
         result = replace(result, command=job.command, name_of=job.name_of)
         notes = [*result.notes, *left_out, *write_files(folder, files, result), *result.warnings()]
@@ -198,29 +196,6 @@ def _choose_files(job: DepthJob, prepared: Prepared) -> tuple[list[str], list[No
     if any(file.endswith((".ply", ".glb")) for file in files):
         require_mesh_extra()
     return files, notes
-
-
-@contextmanager
-def _write_together(out: Path) -> Iterator[Path]:
-    """Yield a temporary folder whose files are moved to `out` at the end; an error leaves `out` unchanged.
-
-    Files of an earlier result that the new result lacks are removed, so that all output files in `out` belong
-    to the same result. An earlier result is recognised by disparity.pfm, which every result has and which is
-    moved first. In a folder without disparity.pfm, files with the names of output files are taken to be the
-    user's and are kept.
-    """
-    standing = make_parent_folder(*(out / file for file in FILES))
-    with tempfile.TemporaryDirectory(prefix=".stereoweave-", dir=standing) as name:
-        yield Path(name)
-        # Without the lock, two commands could leave a mixture of their files.
-        with lock_output(make_folder(out)):
-            is_earlier_result = (out / "disparity.pfm").exists()
-            for file in FILES:
-                fresh = Path(name, file)
-                if fresh.exists():
-                    fresh.replace(out / file)
-                elif is_earlier_result:
-                    (out / file).unlink(missing_ok=True)
 
 
 @step("writing the files")

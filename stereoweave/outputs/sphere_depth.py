@@ -12,10 +12,10 @@ from stereoweave.cameras.sphere_nearness import MatchedWindow, spread_nearness
 from stereoweave.cameras.sphere_windows import BLIND_DEG
 from stereoweave.errors import Note, StereoweaveError
 from stereoweave.io.colormap import colour_disparity, find_colour_range_px, grey_confidence
-from stereoweave.io.files import make_folder, make_parent_folder, replacing
+from stereoweave.io.files import make_parent_folder
 from stereoweave.io.images import write_image
 from stereoweave.io.maps import write_npy, write_pfm
-from stereoweave.io.output_lock import lock_output
+from stereoweave.io.results_folder import replacing_together
 from stereoweave.matching.estimate import match
 from stereoweave.outputs.results import DepthJob
 from stereoweave.pictures.panoramas import spread_views
@@ -141,11 +141,10 @@ def _write(out: Path, found: SphereDepth, facts: SphereFacts) -> None:
     # Nearness has no pixels: scaled so that colours differ as they do for disparities.
     scaled = nearness * 1000 / max(float(nearness.max()), 1e-9)
     range_px = find_colour_range_px(scaled[known][None]) if known.any() else (0.0, 1.0)
-    with lock_output(make_folder(out)):
-        write_pfm(out / "distance.pfm", np.where(known, found.distance, np.inf))
-        write_npy(out / "distance.npy", found.distance)
-        write_image(out / "distance_preview.png", colour_disparity(scaled, range_px) * known[..., None])
-        write_image(out / "distance_confidence.png", grey_confidence(found.confidence))
-        write_image(out / LEFT, found.left)
-        with replacing(out / FACTS) as temporary:
-            temporary.write_text(json.dumps(asdict(facts), indent=2, allow_nan=False) + "\n")
+    with replacing_together(out, (*FILES, LEFT, FACTS)) as folder:
+        write_pfm(folder / "distance.pfm", np.where(known, found.distance, np.inf))
+        write_npy(folder / "distance.npy", found.distance)
+        write_image(folder / "distance_preview.png", colour_disparity(scaled, range_px) * known[..., None])
+        write_image(folder / "distance_confidence.png", grey_confidence(found.confidence))
+        write_image(folder / LEFT, found.left)
+        (folder / FACTS).write_text(json.dumps(asdict(facts), indent=2, allow_nan=False) + "\n")

@@ -1,0 +1,39 @@
+"""Replacement of all files of a result in a folder together."""
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from stereoweave.io.files import make_folder, make_parent_folder
+from stereoweave.io.output_lock import lock_output
+
+
+@contextmanager
+def replacing_together(out: Path, names: Sequence[str]) -> Iterator[Path]:
+    """Yield a temporary folder whose files are moved to `out` at the end; an error leaves `out` unchanged.
+
+    Files of an earlier result that the new result lacks are removed, so that all output files in `out` belong
+    to the same result. An earlier result is recognised by the first name, which every result has and which is
+    moved first. In a folder without it, files with the other names are taken to be the user's and are kept.
+
+    Args:
+        out: Folder of the result; made if it is missing.
+        names: All files that a result can have.
+
+    Raises:
+        OutputInUseError: Another process writes to `out`.
+        StereoweaveError: `out` or one of the files cannot be written.
+    """
+    standing = make_parent_folder(*(out / name for name in names))
+    with tempfile.TemporaryDirectory(prefix=".stereoweave-", dir=standing) as folder:
+        yield Path(folder)
+        # Without the lock, two commands could leave a mixture of their files.
+        with lock_output(make_folder(out)):
+            is_earlier_result = (out / names[0]).exists()
+            for name in names:
+                fresh = Path(folder, name)
+                if fresh.exists():
+                    fresh.replace(out / name)
+                elif is_earlier_result:
+                    (out / name).unlink(missing_ok=True)

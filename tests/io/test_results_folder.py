@@ -1,0 +1,39 @@
+import pytest
+
+from stereoweave.io.results_folder import replacing_together
+
+NAMES = ("map.pfm", "map.png", "notes.json")
+
+
+def write_result(out, files):
+    with replacing_together(out, NAMES) as folder:
+        for name, text in files.items():
+            (folder / name).write_text(text)
+
+
+def read_all(out):
+    return {path.name: path.read_text() for path in out.iterdir()}
+
+
+def test_a_result_replaces_all_files_of_an_earlier_one(tmp_path):
+    out = tmp_path / "out"
+    write_result(out, {"map.pfm": "1", "map.png": "1", "notes.json": "1"})
+    (out / "own.txt").write_text("kept")
+    write_result(out, {"map.pfm": "2", "map.png": "2"})
+    assert read_all(out) == {"map.pfm": "2", "map.png": "2", "own.txt": "kept"}
+
+
+def test_an_error_leaves_the_folder_as_it_was(tmp_path):
+    out = tmp_path / "out"
+    write_result(out, {"map.pfm": "1", "map.png": "1"})
+    with pytest.raises(OSError, match="disk full"), replacing_together(out, NAMES) as folder:
+        (folder / "map.pfm").write_text("2")
+        raise OSError("disk full")
+    assert read_all(out) == {"map.pfm": "1", "map.png": "1"}
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_users_own_files_beside_no_earlier_result_are_kept(tmp_path):
+    (tmp_path / "notes.json").write_text("own")
+    write_result(tmp_path, {"map.pfm": "1"})
+    assert read_all(tmp_path) == {"map.pfm": "1", "notes.json": "own"}
