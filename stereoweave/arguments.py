@@ -5,10 +5,11 @@ fast.
 """
 
 import reprlib
+from collections.abc import Sequence
 from numbers import Integral, Real
-from typing import TYPE_CHECKING, TypeGuard
+from typing import TYPE_CHECKING, TypeGuard, cast
 
-from stereoweave.errors import StereoweaveError
+from stereoweave.errors import Remedy, StereoweaveError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -27,6 +28,23 @@ def check_whole_number(name: str, value: object) -> None:
     """Require an integer within the range of a float."""
     if not isinstance(value, Integral) or isinstance(value, bool) or not _is_held_by_float(value):
         raise StereoweaveError(f"{name}: expected a whole number, got {describe(value)}")
+
+
+def as_two_numbers(
+    setting: str, value: object, expected: str, remedy: Remedy | None = None
+) -> tuple[float, float]:
+    """Return a sequence or an array of two numbers as floats.
+
+    Raises:
+        StereoweaveError: It is something else; the message says what `setting` is expected to be.
+    """
+    is_row = isinstance(value, Sequence) or (is_plain_array(value) and value.ndim == 1)
+    numbers = tuple(cast("Sequence[float]", value)) if is_row else ()
+    if len(numbers) != 2:
+        raise StereoweaveError(f"expected {expected}, got {describe(value)}", setting=setting, remedy=remedy)
+    for number in numbers:
+        check_number(setting, number)
+    return float(numbers[0]), float(numbers[1])
 
 
 def check_flag(name: str, value: object) -> None:

@@ -22,6 +22,7 @@ TESTS = Path(__file__).parent
 # Settings that no constant names, by module and expression.
 VARIABLE: dict[tuple[str, str], set[str]] = {
     ("cameras/spherical.py", "given[0]"): {"whole", "look_deg", "fov_deg", "lens_fov_deg"},
+    ("arguments.py", "setting"): {"range_px", "look_deg"},
     ("cameras/spherical.py", "setting"): {"look_deg", "fov_deg"},
     ("app/pair_form.py", "setting"): {"focal_px", "baseline_m"},
     ("errors.py", "error.setting"): set(),  # of an error that another one takes the place of

@@ -1,12 +1,9 @@
 """Matching options that all interfaces share."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
-from stereoweave.arguments import check_flag, check_number, describe
+from stereoweave.arguments import as_two_numbers, check_flag
 from stereoweave.errors import Remedy, StereoweaveError
 
 
@@ -47,20 +44,11 @@ DEFAULT_OPTIONS = MatchOptions()
 
 
 def _parse_range(range_px: tuple[float, float]) -> tuple[float, float]:
-    is_row = isinstance(range_px, Sequence) or (isinstance(range_px, np.ndarray) and range_px.ndim == 1)
-    if not is_row or len(range_px) != 2:
-        raise _make_range_error(describe(range_px))
-    for value in range_px:
-        check_number("range_px", value)
-    low_px, high_px = map(float, range_px)
+    expected = "the least and the greatest disparity in px, such as -20 and 150"
+    omit = Remedy("omit it for automatic detection")
+    low_px, high_px = as_two_numbers("range_px", range_px, expected, omit)
     if not (math.isfinite(low_px) and math.isfinite(high_px) and low_px < high_px):
-        raise _make_range_error(f"{low_px:g} and {high_px:g}")
+        raise StereoweaveError(
+            f"expected {expected}, got {low_px:g} and {high_px:g}", setting="range_px", remedy=omit
+        )
     return low_px, high_px
-
-
-def _make_range_error(got: str) -> StereoweaveError:
-    return StereoweaveError(
-        f"expected the least and the greatest disparity in px, such as -20 and 150, got {got}; "
-        "omit it for automatic detection",
-        setting="range_px",
-    )
