@@ -2,10 +2,11 @@
 
 from collections.abc import Iterable
 from dataclasses import replace
+from inspect import signature
 from pathlib import Path
 from typing import Literal
 
-from stereoweave.arguments import check_kind, check_number, describe
+from stereoweave.arguments import as_two_numbers, check_kind, check_number, describe
 from stereoweave.cameras import auto_align
 from stereoweave.cameras.diagnosis import find_problems
 from stereoweave.cameras.spherical import SphereRequest
@@ -98,10 +99,8 @@ def _match_images(
         return replace(found, pair=given) if chosen else found
     ready = auto_align.align(given)
     found = match(matcher, ready.pair, options)
-    notes = (
-        *_fit_to_python(ready.notes),
-        *find_problems(ready.pair, found, ready.alignment, _RECTIFY_FIRST),
-    )
+    problems = find_problems(ready.pair, found, ready.alignment, _RECTIFY_FIRST)
+    notes = _fit_to_python((*ready.notes, *problems))
     is_given = ready.pair is given and not chosen
     return replace(found, pair=None if is_given else ready.pair, notes=notes)
 
@@ -115,13 +114,7 @@ def _request_window(
     for name, value in (("fov_deg", fov_deg), ("lens_fov_deg", lens_fov_deg)):
         if value is not None:
             check_number(name, value)
-    look = None
-    if look_deg is not None:
-        if not isinstance(look_deg, tuple) or len(look_deg) != 2:
-            raise StereoweaveError(f"look_deg: expected yaw and pitch, got {describe(look_deg)}")
-        for value in look_deg:
-            check_number("look_deg", value)
-        look = (float(look_deg[0]), float(look_deg[1]))
+    look = None if look_deg is None else as_two_numbers("look_deg", look_deg, "yaw and pitch in degrees")
     return SphereRequest(projection=projection, look_deg=look, fov_deg=fov_deg, lens_fov_deg=lens_fov_deg)
 
 
@@ -138,8 +131,8 @@ def _open_both(file: ImageLike, sphere: SphereRequest, *, aligned: bool) -> Prep
 
 def _fit_to_python(notes: Iterable[Note]) -> tuple[Note, ...]:
     """Return notes without the remedies that name settings which `estimate` does not have."""
-    lacking = {"no_rectify", "format", "whole"}
+    own = set(signature(estimate).parameters)
     return tuple(
-        replace(note, remedy=None) if note.remedy and lacking & set(note.remedy.settings) else note
+        replace(note, remedy=None) if note.remedy and not own.issuperset(note.remedy.settings) else note
         for note in notes
     )

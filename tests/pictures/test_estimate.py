@@ -78,6 +78,31 @@ def test_the_estimate_says_which_problems_remain(example):
     assert sw.estimate(example.left, example.left).notes == ()
 
 
+def test_a_note_advises_nothing_that_the_function_cannot_do(example):
+    # Only a small window has texture, with fewer matches than rectification needs.
+    left, right = np.full((2, *example.left.shape), 90, np.uint8)
+    left[200:290, 200:290] = example.left[200:290, 200:290]
+    right[200 - DOWN_PX : 290 - DOWN_PX, 180:270] = example.right[200:290, 180:270]
+    failed, _ = map(str, sw.estimate(left, right, align="auto").notes)
+    assert failed.startswith("the pair could not be rectified: expected at least 40 feature matches")
+    assert failed.endswith("photograph a scene with more texture and with more overlap")
+
+
+@pytest.mark.usefixtures("without_shape_checks")
+def test_a_direction_may_be_a_list_or_an_array(example):
+    def look(direction):
+        window = {"projection": "half_equirectangular", "look_deg": direction, "fov_deg": 60.0}
+        return sw.estimate(example.left, example.right, **window).disparity_px
+
+    expected_px = look((10.0, 5.0))
+    for direction in ([10.0, 5.0], np.array([10.0, 5.0])):
+        np.testing.assert_array_equal(look(direction), expected_px)
+    with pytest.raises(
+        StereoweaveError, match=r"^look_deg: expected yaw and pitch in degrees, got \[1, 2, 3\]"
+    ):
+        look([1, 2, 3])
+
+
 def test_a_sound_pair_gives_the_same_with_and_without_alignment(example, estimate):
     aligned = sw.estimate(example.left, example.right, align="auto")
     assert aligned.pair is None
