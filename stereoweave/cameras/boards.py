@@ -52,9 +52,11 @@ class Board:
                 f"expected markers smaller than the squares ({1000 * self.square_m:g} mm), "
                 f"found markers of {1000 * self.marker_m:g} mm"
             )
-        if self.dictionary is not None and not hasattr(cv2.aruco, self.dictionary):
-            names = ", ".join(name for name in dir(cv2.aruco) if name.startswith("DICT_"))
-            raise StereoweaveError(f"unknown marker dictionary {self.dictionary}; expected one of {names}")
+        names = [name for name in dir(cv2.aruco) if name.startswith("DICT_")]
+        if self.dictionary is not None and self.dictionary not in names:
+            raise StereoweaveError(
+                f"unknown marker dictionary {self.dictionary}; expected one of {', '.join(names)}"
+            )
 
     def __str__(self) -> str:
         if self.dictionary:

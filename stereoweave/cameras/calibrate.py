@@ -239,13 +239,17 @@ def find_pairs(folder: Path) -> tuple[dict[str, tuple[Path, Path]], dict[str, st
     if not folder.is_dir():
         raise StereoweaveError(f"{folder}: expected a folder with pictures of a board, found no such folder")
     sides: dict[str, dict[bool, Path]] = {}
+    left_out: dict[str, str] = {}
     for path in sorted(folder.rglob("*")):
         relative = path.relative_to(folder).with_suffix("").as_posix()
         marks = _SIDE.findall(relative)
         if path.suffix.lower() in ENDINGS and marks:
-            sides.setdefault(_SIDE.sub("*", relative), {})[marks[-1].lower() in _LEFT_WORDS] = path
+            views = sides.setdefault(_SIDE.sub("*", relative), {})
+            view = views.setdefault(marks[-1].lower() in _LEFT_WORDS, path)
+            if view != path:
+                left_out[str(path.relative_to(folder))] = f"{view.name} is a picture of the same view"
     pairs = {str(key): (found[True], found[False]) for key, found in sides.items() if len(found) == 2}
-    single = {
+    left_out |= {
         str(path.relative_to(folder)): "the picture of the other camera is missing"
         for found in sides.values()
         for path in found.values()
@@ -256,7 +260,7 @@ def find_pairs(folder: Path) -> tuple[dict[str, tuple[Path, Path]], dict[str, st
             f"{folder}: expected pairs of pictures, such as left/01.png and right/01.png or 01_L.png and "
             f"01_R.png, found none among {len(list(folder.rglob('*')))} files"
         )
-    return {left.relative_to(folder).as_posix(): (left, right) for left, right in pairs.values()}, single
+    return {left.relative_to(folder).as_posix(): (left, right) for left, right in pairs.values()}, left_out
 
 
 def _find_all_corners(

@@ -180,6 +180,21 @@ def test_pairs_are_known_by_their_names(tmp_path, names):
     assert left_out == {}
 
 
+def test_a_second_picture_of_a_view_is_left_out_by_name(tmp_path):
+    for name in ("left/01.jpg", "left/01.png", "right/01.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    pairs, left_out = find_pairs(tmp_path)
+    assert pairs == {"left/01.jpg": (tmp_path / "left" / "01.jpg", tmp_path / "right" / "01.png")}
+    assert left_out == {"left/01.png": "01.jpg is a picture of the same view"}
+
+
+@pytest.mark.parametrize("name", ["CharucoBoard", "DICT_9X9_50"])
+def test_an_unknown_dictionary_is_refused_with_the_known_ones(name):
+    with pytest.raises(StereoweaveError, match=f"unknown marker dictionary {name}; expected .*DICT_5X5_100"):
+        replace(CHARUCO, dictionary=name)
+
+
 def test_another_board_than_the_one_named_is_refused(charucos):
     other = replace(CHARUCO, dictionary="DICT_6X6_50")
     with pytest.raises(
