@@ -577,4 +577,4 @@ def _is_picture(file: Path) -> bool:
 
 def _natural_key(file: Path) -> list[tuple[int, str]]:
     parts = re.split(r"(\d+)", file.name)
-    return [(int(part), part) if part.isdigit() else (0, part) for part in parts]
+    return [(int(part), part) if part.isdecimal() else (0, part) for part in parts]

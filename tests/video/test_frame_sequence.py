@@ -94,6 +94,13 @@ def test_pictures_in_turn_are_pairs(tmp_path):
     assert_eyes(video.frames(), pairs)
 
 
+def test_numbered_pictures_may_have_superscripts_in_their_names(tmp_path):
+    pairs = flat_pairs(2)
+    for number, image in enumerate(in_turn(pairs), 8):
+        write_image(tmp_path / f"²{number}.png", image)
+    assert_eyes(open_video([tmp_path], "frame_sequential").frames(), pairs)
+
+
 def test_reading_from_the_middle_and_excerpts_yield_the_same_pairs(tmp_path):
     path = write_video(tmp_path / "a.mp4", in_turn(example_pairs(12)), codec="libx264", options={"g": "7"})
     video = open_video([path], "frame_sequential")
