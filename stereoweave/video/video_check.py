@@ -1,5 +1,6 @@
 """Check of a whole stereo video, shot by shot: depth, defects, and the screens that show it well."""
 
+import copy
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -172,6 +173,7 @@ def check_video(
     if screen is not None:
         find_screen(screen)
     task = bar.add_task("checking the video", total=video.frame_count, loss="", rate="")
+    video = copy.copy(video)  # the caller's keeps its own `on_frame`
     video.on_frame = lambda number: bar.update(task, completed=number + 1)
     spans: list[_Span] = []
     problems: list[str] = []

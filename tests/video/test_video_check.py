@@ -36,6 +36,15 @@ def found(film, matcher):
     return check_video(open_video([film]), matcher, Progress(disable=True))
 
 
+def test_a_checked_video_still_calls_its_own_function_for_each_frame(tmp_path, matcher):
+    video = open_video([write_side_by_side(tmp_path / "flat.mp4", flat_pairs(3))], "side_by_side")
+    video.on_frame = (read := []).append
+    check_video(video, matcher, Progress(disable=True))
+    assert read == []
+    list(video.frames())
+    assert read == [0, 1, 2]
+
+
 def frame_of(left: np.ndarray, right: np.ndarray) -> StereoFrame:
     return StereoFrame(left, right, Fraction(0), None)
 
