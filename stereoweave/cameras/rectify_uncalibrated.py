@@ -167,7 +167,6 @@ def _select_inliers(found: Matches, within_px: float) -> Matches:
     count = len(found.left_px)
     right_ones = np.zeros(count, bool)
     if count >= _LEAST_MATCHES:
-        cv2.setRNGSeed(0)
         with suppress(cv2.error):  # raised if no geometry explains any match
             _, mask = cv2.findFundamentalMat(
                 found.left_px, found.right_px, cv2.USAC_MAGSAC, within_px, 0.9999, 5000
