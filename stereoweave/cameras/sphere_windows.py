@@ -20,6 +20,8 @@ from jaxtyping import Float32
 
 from stereoweave.cameras.spherical import Map, Projection, Rays
 from stereoweave.errors import Remedy, StereoweaveError
+from stereoweave.io.decoding import MOST_PIXELS
+from stereoweave.io.images import SMALLEST_SIDE_PX
 from stereoweave.stereo import LONGEST_SIDE_PX, StereoCamera
 
 LEAST_FOV_DEG, MOST_FOV_DEG = 10.0, 150.0
@@ -222,7 +224,7 @@ def make_window(
 
     Raises:
         StereoweaveError: The direction or the field of view is out of range, the baseline vanishes there, or
-            the window has no more than 31 pixels a side, or far more pixels than the picture.
+            a side of the window is shorter than 32 px, or it has far more pixels than the picture.
     """
     if not LEAST_FOV_DEG <= fov_deg <= MOST_FOV_DEG:
         raise StereoweaveError(
@@ -275,7 +277,7 @@ def make_whole_window(projection: Projection, eye_size_px: tuple[int, int]) -> W
     """Return the window of all directions of a picture, as sharp as the picture.
 
     Raises:
-        StereoweaveError: It has no more than 31 pixels a side, or far more pixels than the picture.
+        StereoweaveError: A side is shorter than 32 px, or it has far more pixels than the picture.
     """
     resolution_px = projection.pixels_per_radian(eye_size_px)
     height_px = _even(math.pi * resolution_px)
@@ -312,10 +314,11 @@ def _check_aside(where: str, angle: float, span: float) -> None:
 
 
 def _check_size(size_px: tuple[int, int], eye_size_px: tuple[int, int]) -> None:
-    if min(size_px) < 32 or max(size_px) > LONGEST_SIDE_PX or size_px[0] * size_px[1] > 65_000_000:
+    fits = min(size_px) >= SMALLEST_SIDE_PX and max(size_px) <= LONGEST_SIDE_PX
+    if not fits or size_px[0] * size_px[1] > MOST_PIXELS:
         raise StereoweaveError(
-            "expected a window of at least 32 pixels a side and at most 65 megapixels, found "
-            f"{size_px[0]}x{size_px[1]}",
+            f"expected a window of {SMALLEST_SIDE_PX} to {LONGEST_SIDE_PX} px a side and at most "
+            f"{MOST_PIXELS / 1e6:g} megapixels, found {size_px[0]}x{size_px[1]} px",
             remedy=Remedy("choose another field of view", ("fov_deg",)),
         )
     if size_px[0] * size_px[1] > _MOST_ENLARGED * eye_size_px[0] * eye_size_px[1]:
