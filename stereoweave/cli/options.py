@@ -278,9 +278,14 @@ def make_engine(cluster: str | None, workers: int | None = None, cpus_each: floa
 
 def parse_size_px(size: str) -> tuple[int, int]:
     """Parse --size into width and height in px."""
-    found = re.fullmatch("([0-9]{1,9})x([0-9]{1,9})", size)
+    return parse_two_counts("--size", size, "width x height in pixels, such as 640x480")
+
+
+def parse_two_counts(option: str, text: str, expected: str) -> tuple[int, int]:
+    """Parse two whole numbers joined by an x; `expected` is how an error describes them."""
+    found = re.fullmatch("([0-9]{1,9})x([0-9]{1,9})", text)
     if found is None:
-        raise StereoweaveError(f"--size: expected width x height in pixels, such as 640x480, found {size!r}")
+        raise StereoweaveError(f"{option}: expected {expected}, found {text!r}")
     return int(found[1]), int(found[2])
 
 

@@ -2,7 +2,6 @@
 
 import json
 import math
-import re
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -22,6 +21,7 @@ from stereoweave.cli.options import (
     Projection,
     make_parent_folder,
     make_sphere_request,
+    parse_two_counts,
 )
 from stereoweave.cli.video_check import is_video, print_video_check, refuse_video_options
 from stereoweave.errors import FormatError, Note, StereoweaveError
@@ -49,6 +49,9 @@ CheckedScreen = Annotated[
         "depth than it shows without strain is then a problem; so are near objects that a border cuts off.",
     ),
 ]
+# The first file marks an earlier result; see `replacing_together`.
+_RECTIFIED = ("left.png", "right.png", "calib.yml")
+
 Timeline = Annotated[
     Path | None,
     typer.Option(metavar="PICTURE", help="Picture to write of the video's depth and problems over time."),
@@ -147,22 +150,21 @@ def rectify(  # noqa: PLR0913 - each is an option of the command line
     from stereoweave.cameras.calibration_files import write_rig
     from stereoweave.cameras.rectify import crop
     from stereoweave.cameras.rig import format_size, pair_size_px, rectified_rig
-    from stereoweave.io.files import make_folder
     from stereoweave.io.images import write_image
-    from stereoweave.io.output_lock import lock_output
+    from stereoweave.io.results_folder import replacing_together
     from stereoweave.pictures.prepare import Request, prepare
 
     out = out or Path(f"{pictures[0].stem}_rectified")
     _check_output(pictures, calib, out)
-    make_parent_folder(out / "left.png", out / "right.png", out / "calib.yml")
+    make_parent_folder(*(out / name for name in _RECTIFIED))
     sphere = make_sphere_request(projection, look, fov, lens_fov)
     prepared = prepare(pictures, Request(format=format, calibration=calib, rectify=True, sphere=sphere))
     pair = crop(prepared.pair)
-    with lock_output(make_folder(out)):
-        write_image(out / "left.png", pair.left)
-        write_image(out / "right.png", pair.right)
+    with replacing_together(out, _RECTIFIED) as folder:
+        write_image(folder / "left.png", pair.left)
+        write_image(folder / "right.png", pair.right)
         if pair.camera:
-            write_rig(out / "calib.yml", rectified_rig(pair))
+            write_rig(folder / "calib.yml", rectified_rig(pair))
     notes = [note.format(running_options()) for note in prepared.notes]
     typer.echo("\n".join([f"{out}: left.png and right.png, {format_size(pair_size_px(pair))} px", *notes]))
 
@@ -170,7 +172,7 @@ def rectify(  # noqa: PLR0913 - each is an option of the command line
 def _check_output(pictures: Sequence[Path], calib: Path | None, out: Path) -> None:
     """Raise StereoweaveError if a result would replace an input, or lie beside an older calib.yml."""
     given = [file for file in (*pictures, calib) if file and file.exists()]
-    for result in (out / "left.png", out / "right.png", out / "calib.yml"):
+    for result in (out / name for name in _RECTIFIED):
         if result.exists() and any(result.samefile(file) for file in given):
             raise StereoweaveError(
                 f"{result}: expected a new file, found one of the inputs; choose another --out"
@@ -218,12 +220,10 @@ def calibrate(  # noqa: PLR0913 - each is an option of the command line
     from stereoweave.cameras.calibrate import calibrate as calibrate_by
     from stereoweave.cameras.calibration_files import write_rig
 
-    match = re.fullmatch(r"(\d+)x(\d+)", board)
-    if match is None:
-        raise StereoweaveError(f"--board: expected columns and rows, such as 9x6, found {board!r}")
+    columns, rows = parse_two_counts("--board", board, "columns and rows, such as 9x6")
     expected = Board(
-        columns=int(match[1]),
-        rows=int(match[2]),
+        columns=columns,
+        rows=rows,
         square_m=square_mm / 1000,
         marker_m=None if marker_mm is None else marker_mm / 1000,
         dictionary=charuco,

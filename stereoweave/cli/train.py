@@ -1,14 +1,12 @@
 """The commands `stereoweave train` and `stereoweave export`."""
 
-import re
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from stereoweave.cli.commands import shows_steps
-from stereoweave.cli.options import require_train_extra
-from stereoweave.errors import StereoweaveError
+from stereoweave.cli.options import parse_size_px, require_train_extra
 
 
 @shows_steps
@@ -72,7 +70,7 @@ def export(  # noqa: PLR0913 - each is an option of the command line
     """
     from stereoweave.data.readers import read_scenes
 
-    size_px = _size_px(size) if size else None
+    size_px = parse_size_px(size) if size else None
     pairs = [scene.pair for scene in read_scenes(scenes)] if scenes else []
     with require_train_extra():
         from stereoweave.learn.export.files import MatcherFiles, write_matcher_files, write_weights
@@ -83,10 +81,3 @@ def export(  # noqa: PLR0913 - each is an option of the command line
     files = MatcherFiles(out=out, half=half, eight_bits=eight_bits, size=size_px)
     for line in write_matcher_files(source, files, pairs, reliability):
         typer.echo(line)
-
-
-def _size_px(size: str) -> tuple[int, int]:
-    found = re.fullmatch("([0-9]{1,5})x([0-9]{1,5})", size)
-    if found is None:
-        raise StereoweaveError(f"--size: expected width x height in pixels, such as 640x480, found {size!r}")
-    return int(found[1]), int(found[2])

@@ -1,7 +1,6 @@
 """The command `stereoweave view`."""
 
 import math
-import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -30,6 +29,7 @@ from stereoweave.cli.options import (
     make_sphere_request,
     parse_largest_size_px,
     parse_range_px,
+    parse_two_counts,
 )
 from stereoweave.errors import Note, StereoweaveError
 
@@ -234,10 +234,8 @@ def _parse_quilt(quilt: str | None) -> "LayoutOptions":
 
     if quilt is None:
         return LayoutOptions()
-    match = re.fullmatch(r"(\d+)x(\d+)", quilt)
-    if match is None:
-        raise StereoweaveError(f"--quilt: expected columns and rows, such as 8x6, found {quilt!r}")
-    return LayoutOptions(columns=int(match[1]), rows=int(match[2]))
+    columns, rows = parse_two_counts("--quilt", quilt, "columns and rows, such as 8x6")
+    return LayoutOptions(columns=columns, rows=rows)
 
 
 def _parse_crop(crop: str | None) -> bool:
