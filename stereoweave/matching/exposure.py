@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Shaped, UInt8
 
-from stereoweave.stereo import Estimate
+from stereoweave.stereo import Estimate, StereoPair
 
 # Both images are downsampled to about this many pixels, which is enough to fit a curve and to average out
 # noise.
@@ -102,6 +102,12 @@ def recolour(
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Apply a lookup table with values in 0..255 to each channel, and round the result."""
     return cv2.LUT(image, np.rint(table).astype(np.uint8)[None])
+
+
+def equalise_right(pair: StereoPair, estimate: Estimate) -> UInt8[np.ndarray, "h w 3"]:
+    """Return the right image with the exposure and the colours of the left one."""
+    looks = match_exposure(pair.left, pair.right, estimate)
+    return recolour(pair.right, looks.tables(0)[1]) if looks else pair.right
 
 
 def match_exposure(

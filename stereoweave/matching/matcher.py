@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float, UInt8
 from stereoweave.arguments import check_kind
 from stereoweave.errors import MatcherError, StereoweaveError
 from stereoweave.io.images import SMALLEST_SIDE_PX
+from stereoweave.matching.contrast import measure_contrast
 from stereoweave.matching.edge_vote.vote import sharpen_edges, vote_at_edges
 from stereoweave.matching.left_right_check import find_contradicted, is_occluded, measure_disagreement
 from stereoweave.matching.network import Network
@@ -396,10 +397,11 @@ def _estimate(left: UInt8[np.ndarray, "h w 3"], maps: Maps) -> Estimate:
     assert right_px is not None
     disagreement_px, inside = measure_disagreement(maps.disparity_px, right_px)
     contradicted = find_contradicted(maps.disparity_px, right_px)
+    plain = measure_contrast(left, _PLAIN_MEAN_PX, _PLAIN_WINDOW_PX) <= _PLAIN_GREY_LEVELS
     return Estimate(
         disparity_px=maps.disparity_px,
         right_disparity_px=right_px,
-        confidence=_confidence(maps.confidence_logit, disagreement_px, contradicted, _find_plain(left)),
+        confidence=_confidence(maps.confidence_logit, disagreement_px, contradicted, plain),
         occluded=is_occluded(disagreement_px, inside),
     )
 
@@ -431,11 +433,3 @@ def _confidence(
         np.multiply(probability, 0.5, out=probability, where=contradicted)
     probability[plain] = 0
     return probability
-
-
-def _find_plain(image: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
-    """Return the mask of plain pixels, those with nearly equal local means in the window around them."""
-    window = np.ones((_PLAIN_WINDOW_PX, _PLAIN_WINDOW_PX), np.uint8)
-    means = cv2.blur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (_PLAIN_MEAN_PX, _PLAIN_MEAN_PX))
-    contrast = cv2.morphologyEx(means, cv2.MORPH_GRADIENT, window)
-    return contrast <= _PLAIN_GREY_LEVELS

@@ -15,7 +15,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32, UInt8
 
-from stereoweave.matching.exposure import match_exposure, recolour
+from stereoweave.matching.contrast import measure_contrast
+from stereoweave.matching.exposure import equalise_right
 from stereoweave.matching.left_right_check import at_match, is_occluded, measure_disagreement
 from stereoweave.matching.step_penalties import penalise_large_steps
 from stereoweave.stereo import Estimate, StereoPair, check_fits
@@ -51,7 +52,7 @@ _COARSE = np.float32(0.7)
 # to 88 % are there within 1 px of the truth (rendered pairs). On plain walls 20 to 50 % are, because false
 # matches agree there too.
 _CONFIRMED = np.float32(0.7)
-_TEXTURE_PX, _TEXTURE_LEVELS = 5, 8
+_TEXTURE_MEAN_PX, _TEXTURE_PX, _TEXTURE_LEVELS = 3, 5, 8
 _MOST_THREADS = 4
 
 
@@ -98,9 +99,7 @@ def refine(
     """
     pair = StereoPair(left=left, right=right)
     check_fits(estimate, pair)
-    looks = match_exposure(left, right, estimate)
-    if looks is not None:
-        pair = StereoPair(left=left, right=recolour(right, looks.tables(0)[1]))
+    pair = StereoPair(left=left, right=equalise_right(pair, estimate))
     trust, right_trust = np.asarray(estimate.confidence, np.float32, order="C"), right_confidence(estimate)
     count = min(_MOST_THREADS, thread_count(threads))
     found_px, right_found_px = _match_views(pair, estimate, right_trust, count)
@@ -111,7 +110,8 @@ def refine(
     disagreement_px, inside = measure_disagreement(disparity_px, right_disparity_px)
     agreed = inside & (np.abs(disagreement_px) <= _SAME_PX)
     # A confidence of 0 marks pixels without content or texture.
-    confirmed = agreed & (estimate.confidence > 0) & _find_texture(left)
+    textured = measure_contrast(left, _TEXTURE_MEAN_PX, _TEXTURE_PX) >= _TEXTURE_LEVELS
+    confirmed = agreed & (estimate.confidence > 0) & textured
     return Estimate(
         disparity_px=disparity_px,
         right_disparity_px=right_disparity_px,
@@ -332,13 +332,6 @@ def _place(cue: np.ndarray, columns: np.ndarray, inside: slice) -> np.ndarray:
     placed[..., : inside.start], placed[..., inside.stop :] = cue[..., :1], cue[..., -1:]
     placed[..., inside] = cue[..., columns[0] + inside.start : columns[0] + inside.stop]
     return placed
-
-
-def _find_texture(image: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
-    """Return the mask of pixels around which the grey level varies by more than noise does."""
-    means = cv2.blur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (3, 3))
-    window = np.ones((_TEXTURE_PX, _TEXTURE_PX), np.uint8)
-    return cv2.morphologyEx(means, cv2.MORPH_GRADIENT, window) >= _TEXTURE_LEVELS
 
 
 def right_confidence(estimate: Estimate) -> Float32[np.ndarray, "h w"]:

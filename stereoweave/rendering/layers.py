@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from stereoweave.matching.exposure import match_exposure, recolour
+from stereoweave.matching.exposure import equalise_right
 from stereoweave.matching.left_right_check import OCCLUSION_STEP_PX
 from stereoweave.rendering.canvas_kernels import NOTHING, SAME_SURFACE_PX
 from stereoweave.rendering.speckles import find_nearer_px, find_nearest, find_speckles, remove_speckles
@@ -220,8 +220,7 @@ def _look_behind(
     met_px = cv2.remap(met_px, u - front_px, v, cv2.INTER_NEAREST, borderValue=[float(NOTHING)])
     beside &= abs(met_px - front_px) <= OCCLUSION_STEP_PX
     behind_px[beside] = front_px[beside]
-    looks = match_exposure(pair.left, pair.right, estimate)
-    right = recolour(pair.right, looks.tables(0)[1]) if looks else pair.right
+    right = equalise_right(pair, estimate)
     return behind_px, cv2.remap(right, u - behind_px, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
