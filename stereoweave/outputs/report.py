@@ -1,7 +1,6 @@
 """Self-contained HTML report on a result: images, a summary, and new views with a slider."""
 
 import html
-import json
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
@@ -21,6 +20,7 @@ from stereoweave.io.colormap import (
 from stereoweave.io.maps import find_scale, format_scale
 from stereoweave.io.text import writing_text
 from stereoweave.outputs.metres import format_metres
+from stereoweave.outputs.page_parts import embed_json
 from stereoweave.outputs.report_parts import (
     download_card,
     fill_template,
@@ -210,8 +210,7 @@ def _collect_fields(
         "downloads": download_card(context.files),
         "command": term_list([("Command", context.command)], kind="long") if context.command else "",
         "making": term_list(_list_making(context)),
-        # "</" would end the script element that contains the data.
-        "data": json.dumps(data).replace("</", "<\\/"),
+        "data": embed_json(data),
     }
 
 

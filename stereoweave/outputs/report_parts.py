@@ -4,19 +4,21 @@ The template, the style and the scripts are in report_page/. All text is escaped
 """
 
 import base64
-import hashlib
 import html
-import importlib.resources
 import string
 import zlib
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from stereoweave.outputs.page_parts import hash_source, read_page_part
 from stereoweave.outputs.viewer import viewer_script
+
+_read = partial(read_page_part, "report_page")
 
 # What the result's files contain. The report links to those that were written with it.
 CONTENTS = {
@@ -51,10 +53,12 @@ def fill_template(fields: Mapping[str, object]) -> str:
 
     The page may run only these scripts: their checksum is part of the content security policy.
     """
-    style, script = _read("page.css"), "".join([_read("mesh.js"), viewer_script(), _read("page.js")])
-    checksum = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    style, script = (
+        _read("page.css"),
+        "".join([_read("mesh.js"), viewer_script(), _read("page.js")]),
+    )
     return string.Template(_read("page.html")).substitute(
-        fields, style=style, script=script, checksum=f"sha256-{checksum}"
+        fields, style=style, script=script, checksum=hash_source(script)
     )
 
 
@@ -135,11 +139,6 @@ def pack_map(
         "step_px": step_px,
         "packed": base64.b64encode(packed).decode(),
     }
-
-
-def _read(name: str) -> str:
-    source = importlib.resources.files("stereoweave.outputs") / "report_page" / name
-    return source.read_text(encoding="utf-8")
 
 
 def _view_tag(position: float, image: UInt8[np.ndarray, "h w 3"]) -> str:

@@ -3,17 +3,18 @@
 `viewer_script` and `viewer_scene.pack_scene` are the parts of the page, for other pages that show a scene.
 """
 
-import base64
-import hashlib
 import html
-import importlib.resources
 import json
 import string
+from functools import partial
 from pathlib import Path
 
 from stereoweave.io.text import writing_text
+from stereoweave.outputs.page_parts import embed_json, hash_source, read_page_part
 from stereoweave.outputs.viewer_scene import LARGEST_PX, pack_scene
 from stereoweave.stereo import Estimate, StereoPair
+
+_read = partial(read_page_part, "viewer_page")
 
 
 def make_viewer(  # noqa: PLR0913 - all but the first two are optional
@@ -51,11 +52,10 @@ def make_viewer(  # noqa: PLR0913 - all but the first two are optional
         title=html.escape(title),
         style=style,
         script=script,
-        style_hash=_hash(style),
-        script_hash=_hash(script),
+        style_hash=hash_source(style),
+        script_hash=hash_source(script),
         still=still,
-        # "</" would end the script element that contains the data.
-        scene=json.dumps(scene).replace("</", "<\\/"),
+        scene=embed_json(scene),
     )
 
 
@@ -73,13 +73,3 @@ def viewer_script() -> str:
     """
     shaders = {f"{kind}_shader": json.dumps(_read(f"view.{kind[:4]}")) for kind in ("vertex", "fragment")}
     return string.Template(_read("viewer.js")).substitute(shaders)
-
-
-def _read(name: str) -> str:
-    source = importlib.resources.files("stereoweave.outputs") / "viewer_page" / name
-    return source.read_text(encoding="utf-8")
-
-
-def _hash(text: str) -> str:
-    """Return the source expression by which a content security policy allows exactly this text."""
-    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()

@@ -167,7 +167,10 @@ def _find_landing(
 
 
 def _encode_layers(layers: Layers, low_px: float) -> dict[str, str]:
-    """Return images and disparities of the layers as addresses, of less than `_MOST_BYTES` in total."""
+    """Return images and disparities of the layers as addresses, of less than `_MOST_BYTES` in total.
+
+    The images have the best quality for which this holds, or else the lowest one.
+    """
     thin_px = _thin(layers.behind_px)
     nearer_px = find_nearer_px(layers.front_px)
     depths = {
