@@ -11,7 +11,7 @@ import numpy as np
 from fuzz.targets import Target, read_every_way, write_to_bytes
 from fuzz.targets.pictures import eyes
 from stereoweave.video.reader import open_video
-from stereoweave.video.tracks import is_spatial_file, open_track
+from stereoweave.video.tracks import open_track, shows_one_view
 
 _FRAMES = 5
 _KINDS = {
@@ -63,7 +63,7 @@ def _write(path: Path, codec: str) -> None:
 
 def _read(path: Path) -> None:
     # Detection would take most of the time; the target for pictures covers it.
-    format = None if is_spatial_file(path) else "side_by_side"
+    format = None if shows_one_view(path, spatial_only=True) else "side_by_side"
     read_every_way(
         *(partial(_read_frames, path, each) for each in (format, "two_streams", "frame_sequential"))
     )

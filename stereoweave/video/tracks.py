@@ -345,11 +345,6 @@ def open_track(path: Path, rate: Fraction | None) -> Track:
     return PictureTrack(str(path), files, rate or Fraction(25))
 
 
-def is_spatial_file(path: Path) -> bool:
-    """Return whether a file is a spatial video (MV-HEVC); False for a file that cannot be decoded."""
-    return shows_one_view(path, spatial_only=True)
-
-
 def shows_one_view(path: Path, *, spatial_only: bool = False) -> bool:
     """Return whether a file says that each frame shows one view: of a spatial video, or of two views in turn.
 
