@@ -222,7 +222,9 @@ def claims_table(rows: Sequence[PaperRow], depth: bool = False) -> str:
         "|---|---|---|---|---|",
     ]
     exponents = {row.setting: row.exponent for row in rows if row.claim == ADJUSTMENT}
-    others = [setting for setting, exponent in exponents.items() if exponent not in (1.0, 1.5)]
+    others = [
+        name for name in sorted(exponents, key=exponents.__getitem__) if exponents[name] not in (1.0, 1.5)
+    ]
     for comparison in list_comparisons(depth, others):
         values = reductions_by_seed(rows, comparison)
         if not values:
