@@ -241,7 +241,7 @@ def _process_pair(out: Path, job: DepthJob, pair: NamedPair) -> str | None:
         if pair.calibration and not job.request.calibration:
             job = replace(job, request=replace(job.request, calibration=pair.calibration))
         start_s = time.perf_counter()
-        summary, notes = make_depth(pair.pictures, folder, job)
+        summary, notes = make_depth(pair.pictures, folder, job, owns_out=True)
         seconds = round(time.perf_counter() - start_s, 3)
         files = sorted(path.name for path in folder.iterdir() if path.name[0] != ".")
         lines = [note.format(job.name_of) for note in notes]

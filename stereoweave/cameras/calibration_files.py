@@ -86,12 +86,20 @@ def add_camera(pair: StereoPair, path: str | Path) -> StereoPair:
     return replace(pair, camera=rig.camera())
 
 
+def check_rig_name(path: str | Path) -> None:
+    """Raise StereoweaveError if the file extension is not that of YAML."""
+    if Path(path).suffix.lower() not in (".yml", ".yaml"):
+        found = Path(path).suffix or "none"
+        raise StereoweaveError(f"{path}: expected the file extension .yml or .yaml, found {found}")
+
+
 def write_rig(path: str | Path, rig: Rig) -> None:
     """Write a rig as OpenCV's YAML, from which `read_rig` restores the rig exactly.
 
     OpenCV's cv2.FileStorage also reads the file. The entries are image_width, image_height, distortion_model,
     M1, D1, M2, D2, R, T and translation_unit.
     """
+    check_rig_name(path)
     if rig.left.fisheye != rig.right.fisheye:
         raise StereoweaveError(
             f"{path}: expected two lenses of the same model, found a pinhole and a fisheye lens"

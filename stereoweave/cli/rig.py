@@ -77,6 +77,7 @@ def check(  # noqa: PLR0913 - each is an option of the command line
     eyes and near objects that a border cuts off, shot by shot. The exit status is 1 if there is a problem.
     """
     from stereoweave.cameras.alignment import check_pair
+    from stereoweave.io.files import refuse_inputs
     from stereoweave.pictures.loading import open_pictures
     from stereoweave.video.reader import open_video
 
@@ -89,6 +90,8 @@ def check(  # noqa: PLR0913 - each is an option of the command line
         opened = None
     if opened is None:
         name = ", ".join(picture.name for picture in pictures)
+        if timeline is not None:
+            refuse_inputs([timeline], pictures)
         print_video_check(open_video(pictures, format, sphere=sphere), name, screen, timeline, as_json)
         return
     refuse_video_options(screen, timeline)
@@ -160,7 +163,8 @@ def rectify(  # noqa: PLR0913 - each is an option of the command line
     sphere = make_sphere_request(projection, look, fov, lens_fov)
     prepared = prepare(pictures, Request(format=format, calibration=calib, rectify=True, sphere=sphere))
     pair = crop(prepared.pair)
-    with replacing_together(out, _RECTIFIED) as folder:
+    written = _RECTIFIED if pair.camera else _RECTIFIED[:2]
+    with replacing_together(out, _RECTIFIED, written) as folder:
         write_image(folder / "left.png", pair.left)
         write_image(folder / "right.png", pair.right)
         if pair.camera:
@@ -171,12 +175,9 @@ def rectify(  # noqa: PLR0913 - each is an option of the command line
 
 def _check_output(pictures: Sequence[Path], calib: Path | None, out: Path) -> None:
     """Raise StereoweaveError if a result would replace an input, or lie beside an older calib.yml."""
-    given = [file for file in (*pictures, calib) if file and file.exists()]
-    for result in (out / name for name in _RECTIFIED):
-        if result.exists() and any(result.samefile(file) for file in given):
-            raise StereoweaveError(
-                f"{result}: expected a new file, found one of the inputs; choose another --out"
-            )
+    from stereoweave.io.files import refuse_inputs
+
+    refuse_inputs((out / name for name in _RECTIFIED), [*pictures, *([calib] if calib else [])])
     if calib is None and (out / "calib.yml").exists():
         raise StereoweaveError(
             f"{out / 'calib.yml'}: expected no file, because pictures rectified without --calib have no "
@@ -218,8 +219,9 @@ def calibrate(  # noqa: PLR0913 - each is an option of the command line
     """Calibrate two cameras from pictures of a board. Reports how accurate the result is."""
     from stereoweave.cameras.boards import Board
     from stereoweave.cameras.calibrate import calibrate as calibrate_by
-    from stereoweave.cameras.calibration_files import write_rig
+    from stereoweave.cameras.calibration_files import check_rig_name, write_rig
 
+    check_rig_name(out)
     columns, rows = parse_two_counts("--board", board, "columns and rows, such as 9x6")
     expected = Board(
         columns=columns,

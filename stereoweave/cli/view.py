@@ -177,6 +177,7 @@ def _render(
     """Match a pair, write its views, and print what was written."""
     from stereoweave.cameras.diagnosis import find_problems
     from stereoweave.cameras.rectify import crop as crop_to_content
+    from stereoweave.io.files import refuse_inputs
     from stereoweave.matching.estimate import match
     from stereoweave.outputs.sphere_views import write_whole_view
     from stereoweave.system.compiling_ahead import compile_ahead
@@ -184,6 +185,7 @@ def _render(
     pair = prepared.pair if whole else crop_to_content(prepared.pair)
     file = file.add_mark(pair)
     make_parent_folder(file.path)
+    refuse_inputs([file.path], prepared.pictures)
     compile_ahead(*file.rehearsals)
     estimate = match(backend.matcher(), pair, options)
     if whole:

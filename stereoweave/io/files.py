@@ -3,7 +3,7 @@
 import re
 import stat
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from uuid import uuid4
@@ -65,6 +65,17 @@ def make_parent_folder(*files: Path) -> Path:
             raise StereoweaveError(f"{file}: expected a writable file, found a folder", remedy=_ANOTHER)
     # A dangling link counts as existing, because no folder can be created in its place.
     return make_folder(next(path for path in files[0].parents if path.exists() or path.is_symlink()))
+
+
+def refuse_inputs(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
+    """Raise StereoweaveError if an output would replace an input."""
+    given = [path for path in inputs if path.exists()]
+    for output in outputs:
+        if output.exists() and any(output.samefile(path) for path in given):
+            raise StereoweaveError(
+                f"{output}: expected a new file, found one of the inputs",
+                remedy=Remedy("choose another one", ("out",)),
+            )
 
 
 @contextmanager

@@ -5,12 +5,13 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from stereoweave.errors import Remedy, StereoweaveError
 from stereoweave.io.files import make_folder, make_parent_folder
 from stereoweave.io.output_lock import lock_output
 
 
 @contextmanager
-def replacing_together(out: Path, names: Sequence[str]) -> Iterator[Path]:
+def replacing_together(out: Path, names: Sequence[str], written: Sequence[str]) -> Iterator[Path]:
     """Yield a temporary folder whose files are moved to `out` at the end; an error leaves `out` unchanged.
 
     Files of an earlier result that the new result lacks are removed, so that all output files in `out` belong
@@ -20,12 +21,14 @@ def replacing_together(out: Path, names: Sequence[str]) -> Iterator[Path]:
     Args:
         out: Folder of the result; made if it is missing.
         names: All files that a result can have.
+        written: The files that this result has, which must not be there without the first name.
 
     Raises:
         OutputInUseError: Another process writes to `out`.
-        StereoweaveError: `out` or one of the files cannot be written.
+        StereoweaveError: `out` or one of the files cannot be written, or would replace a file of the user's.
     """
     standing = make_parent_folder(*(out / name for name in names))
+    _refuse_others(out, names[0], written)
     with tempfile.TemporaryDirectory(prefix=".stereoweave-", dir=standing) as folder:
         yield Path(folder)
         # Without the lock, two commands could leave a mixture of their files.
@@ -37,3 +40,15 @@ def replacing_together(out: Path, names: Sequence[str]) -> Iterator[Path]:
                     fresh.replace(out / name)
                 elif is_earlier_result:
                     (out / name).unlink(missing_ok=True)
+
+
+def _refuse_others(out: Path, first: str, written: Sequence[str]) -> None:
+    """Raise StereoweaveError if `out` has one of the files to write, but no earlier result."""
+    if not (out / first).exists():
+        for name in written:
+            if (out / name).exists():
+                raise StereoweaveError(
+                    f"{out / name}: expected no file, or one of an earlier result with its {first}, found a "
+                    "file of another origin",
+                    remedy=Remedy("choose another folder", ("out",)),
+                )

@@ -128,14 +128,20 @@ class DepthJob:
                 )
 
 
-def make_depth(pictures: Sequence[Path], out: Path, job: DepthJob) -> tuple[Summary, list[Note]]:
-    """Write all the results for a pair to `out` atomically. Returns the summary and user-facing notes."""
+def make_depth(
+    pictures: Sequence[Path], out: Path, job: DepthJob, *, owns_out: bool = False
+) -> tuple[Summary, list[Note]]:
+    """Write all the results for a pair to `out` atomically. Returns the summary and user-facing notes.
+
+    Files in `out` that are not of an earlier result are replaced only with `owns_out`, for a folder that no
+    one else writes to.
+    """
     matcher = job.backend.matcher()
     prepared = prepare(pictures, job.request)
     files, left_out = _choose_files(job, prepared)
     if REPORT in files:
         compile_ahead(rehearse_drawing, rehearse_filling)
-    with replacing_together(out, tuple(FILES)) as folder:
+    with replacing_together(out, tuple(FILES), () if owns_out else files) as folder:
         result = run(prepared, matcher, job.options)
         result = replace(result, command=job.command, name_of=job.name_of)
         notes = [*result.notes, *left_out, *write_files(folder, files, result), *result.warnings()]

@@ -14,6 +14,7 @@ from rich.progress import Progress
 
 from stereoweave import __version__
 from stereoweave.errors import Remedy, StereoweaveError
+from stereoweave.io.files import refuse_inputs
 from stereoweave.io.output_lock import lock_output
 from stereoweave.matching.edge_vote.vote import rehearse_voting
 from stereoweave.pictures.panoramas import NO_SPHERE
@@ -199,11 +200,7 @@ def _check_output(out: Path, job: VideoJob, video: StereoVideo, sources: Sequenc
         raise StereoweaveError(
             f"{out}: expected the file extension .mkv for 16-bit depth, found {out.suffix or 'none'}"
         )
-    for source in sources:
-        if source.exists() and out.exists() and out.samefile(source):
-            raise StereoweaveError(
-                f"{out}: expected an output file other than the input, found the same file"
-            )
+    refuse_inputs([out], sources)
     check_container(out, video.sound)
 
 

@@ -89,11 +89,18 @@ MISTAKES = {
     # Rigs.
     f"check {PAIR} small.png": "expected two pictures, left and right, or one that holds both views, found "
     "3: left.png right.png small.png",
-    f"rectify {PAIR} -o .": "left.png: expected a new file, found one of the inputs; choose another --out",
+    f"rectify {PAIR} -o .": "left.png: expected a new file, found one of the inputs; "
+    "choose another one (--out)",
+    f"view {PAIR} -o ./left.png": "left.png: expected a new file, found one of the inputs; "
+    "choose another one (--out)",
+    f"view {PAIR} -o right.png": "right.png: expected a new file, found one of the inputs; "
+    "choose another one (--out)",
     "calibrate none -o calib.yml --board 9x6 --square-mm 25": "none: expected a folder with pictures of a "
     "board, found no such folder",
     "calibrate boards -o calib.yml --board 9 --square-mm 25": "--board: expected columns and rows, such as "
     "9x6, found '9'",
+    "calibrate boards -o left.png --board 9x6 --square-mm 25": "left.png: expected the file extension "
+    ".yml or .yaml, found .png",
     f"{CALIBRATE} 0": "expected a board of at least 3x3 with squares larger than 0 mm, found 9x6 with "
     "squares of 0 mm",
     f"{CALIBRATE} 25 --charuco DICT_5X5_100": "expected both the dictionary and the size of a ChArUco "

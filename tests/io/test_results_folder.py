@@ -1,12 +1,13 @@
 import pytest
 
+from stereoweave.errors import StereoweaveError
 from stereoweave.io.results_folder import replacing_together
 
 NAMES = ("map.pfm", "map.png", "notes.json")
 
 
 def write_result(out, files):
-    with replacing_together(out, NAMES) as folder:
+    with replacing_together(out, NAMES, tuple(files)) as folder:
         for name, text in files.items():
             (folder / name).write_text(text)
 
@@ -26,7 +27,7 @@ def test_a_result_replaces_all_files_of_an_earlier_one(tmp_path):
 def test_an_error_leaves_the_folder_as_it_was(tmp_path):
     out = tmp_path / "out"
     write_result(out, {"map.pfm": "1", "map.png": "1"})
-    with pytest.raises(OSError, match="disk full"), replacing_together(out, NAMES) as folder:
+    with pytest.raises(OSError, match="disk full"), replacing_together(out, NAMES, NAMES[:2]) as folder:
         (folder / "map.pfm").write_text("2")
         raise OSError("disk full")
     assert read_all(out) == {"map.pfm": "1", "map.png": "1"}
@@ -37,3 +38,13 @@ def test_a_users_own_files_beside_no_earlier_result_are_kept(tmp_path):
     (tmp_path / "notes.json").write_text("own")
     write_result(tmp_path, {"map.pfm": "1"})
     assert read_all(tmp_path) == {"map.pfm": "1", "notes.json": "own"}
+
+
+def test_a_users_own_file_is_not_replaced(tmp_path):
+    (tmp_path / "map.png").write_text("own")
+    with pytest.raises(
+        StereoweaveError, match=r"map.png: expected no file, or .* with its map.pfm"
+    ) as caught:
+        write_result(tmp_path, {"map.pfm": "1", "map.png": "1"})
+    assert "\n" not in str(caught.value)
+    assert read_all(tmp_path) == {"map.png": "own"}

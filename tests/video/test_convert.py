@@ -441,7 +441,7 @@ def test_a_damaged_frame_is_reported_with_its_time_and_does_not_end_the_video(tm
         ("out.mp4", ["--position", "1", "--strength", "4"], "position 1 at strength 4"),
         ("out.gif", ["--depth"], "expected the file extension .mp4 or .mkv or .mov, found .gif"),
         ("out.mp4", ["--depth16"], "expected the file extension .mkv for 16-bit depth, found .mp4"),
-        ("in.mp4", ["--depth"], "expected an output file other than the input, found the same file"),
+        ("in.mp4", ["--depth"], "in.mp4: expected a new file, found one of the inputs"),
         ("out.mp4", ["--depth", "--model", "huge"], "unknown model 'huge'"),
         ("out.mp4", ["--depth", "--format", "diagonal"], "--format: expected one of side_by_side"),
         ("out.mp4", ["--position", "0", "--convergence", "nan"], "--convergence: expected a finite number"),
