@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from stereoweave.cameras.baseline_direction import STACKED, has_vertical_baseline
 from stereoweave.cameras.disparity_sign import estimate_depth_order, find_negative_disparities
 from stereoweave.cameras.feature_matches import Matches, find_matches
 from stereoweave.cameras.vertical_errors import VerticalErrors, fit_vertical_errors
@@ -16,6 +17,7 @@ from stereoweave.errors import Note, Remedy
 Defect = Literal[
     "too_few_matches",
     "unrelated",
+    "stacked",
     "same_picture",
     "swapped",
     "vertical_shift",
@@ -89,7 +91,7 @@ class Alignment:
 
     @property
     def is_known(self) -> bool:
-        """Whether enough points match; if not, all numbers but `matches` are NaN."""
+        """Whether enough points match, and along the rows; if not, all numbers but `matches` are NaN."""
         return not math.isnan(self.vertical_error_px)
 
     @property
@@ -138,6 +140,8 @@ class Alignment:
                     "pictures show different scenes, or were taken from points too far apart",
                     Remedy("give the two pictures of one pair"),
                 )
+            case "stacked":
+                return STACKED
             case "same_picture":
                 return Note(
                     f"left and right show the same view: all disparities are {self._describe_range()} px, "
@@ -201,14 +205,16 @@ def check_pair(left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3
     centre_px = (np.array(right.shape[1::-1]) - 1) / 2
     errors = fit_vertical_errors(found, centre_px, scale) if count >= _LEAST_MATCHES else None
     if errors is None:
-        return _make_unknown(left, right, count)
+        return _make_unknown(count, _explain_few_matches(left, right))
+    if has_vertical_baseline(found, scale):
+        return _make_unknown(count, "stacked")
     matches = found.select(errors.inliers)
     # A rotation also moves the upper and lower parts of the picture sideways.
     disparity_px = matches.disparity_px - errors.slope * (matches.right_px[:, 1] - centre_px[1])
     shared = _find_supported(matches, disparity_px, scale)
     disparity_px = disparity_px[shared]
     if len(disparity_px) < _LEAST_MATCHES:
-        return _make_unknown(left, right, count)
+        return _make_unknown(count, _explain_few_matches(left, right))
     small = _shrink(left, scale), _level(_shrink(right, scale), errors.shift_px / scale, errors.slope)
     negative_px = scale * find_negative_disparities(
         *small, matches.left_px[shared] / scale, disparity_px / scale
@@ -267,12 +273,15 @@ def _measure_range(
     return float(least_px), float(greatest_px)
 
 
-def _make_unknown(
-    left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"], matches: int
-) -> Alignment:
-    """Return the alignment of a pair without enough matches: plain, or of two scenes."""
-    nan = float("nan")
+def _explain_few_matches(left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"]) -> Defect:
+    """Return why a pair has too few matches: it is plain, or of two scenes."""
     textured = min(_measure_textured_share(image) for image in (left, right)) > _LEAST_TEXTURED_SHARE
+    return "unrelated" if textured else "too_few_matches"
+
+
+def _make_unknown(matches: int, defect: Defect) -> Alignment:
+    """Return the alignment of a pair whose rows cannot be compared."""
+    nan = float("nan")
     return Alignment(
         matches=matches,
         vertical_error_px=nan,
@@ -283,7 +292,7 @@ def _make_unknown(
         range_px=(nan, nan),
         negative_percent=nan,
         exposure_ratio=nan,
-        defects=("unrelated" if textured else "too_few_matches",),
+        defects=(defect,),
     )
 
 

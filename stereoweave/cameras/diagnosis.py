@@ -51,6 +51,8 @@ def _find_defects(pair: StereoPair, estimate: Estimate, alignment: Alignment, re
         warnings = alignment.warnings()
         if warnings:
             return [replace(note, remedy=remedy) if note.remedy == RECTIFY else note for note in warnings]
+    elif "stacked" in alignment.defects:
+        return alignment.warnings()
     seen = np.ones(estimate.confidence.shape, bool) if pair.left_seen is None else pair.left_seen
     confident_percent = 100 * float((estimate.confidence >= _CONFIDENT)[seen].mean()) if seen.any() else 0.0
     if confident_percent < _LEAST_CONFIDENT_PERCENT:

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
+from stereoweave.cameras.baseline_direction import STACKED, has_vertical_baseline
 from stereoweave.cameras.camera_fit import CameraFit, Warps, fit_again, fit_cameras, make_parallel_cameras
 from stereoweave.cameras.feature_matches import Matches, find_matches
 from stereoweave.cameras.picture_warp import undistort
@@ -102,7 +103,8 @@ def rectify_by_features(pair: StereoPair) -> Rectified:
     Source: "Quasi-Euclidean epipolar rectification of uncalibrated images" (Fusiello and Irsara 2011).
 
     Raises:
-        StereoweaveError: There are too few matches, or no rotation aligns their rows.
+        StereoweaveError: There are too few matches, no rotation aligns their rows, or one camera is above the
+            other.
     """
     found = fit_warps(pair)
     return Rectified(pair=found.apply(pair), notes=(found.note,))
@@ -124,6 +126,8 @@ def fit_warps(pair: StereoPair, *, parallel: bool = False) -> Fit:
     height, width = pair.left.shape[:2]
     scale = max(1.0, (width * height / _PIXELS_OF_DISTANCE) ** 0.5)
     found = find_matches(pair.left, pair.right)
+    if len(found.left_px) >= _LEAST_MATCHES and has_vertical_baseline(found, scale):
+        raise StereoweaveError(STACKED.text, remedy=STACKED.remedy)
     first = _select_inliers(found, scale * _FIRST_PX)
     if pair.camera and parallel:
         with suppress(StereoweaveError):

@@ -38,6 +38,7 @@ _BAD, _SECOND = (200, 45, 45), (225, 130, 20)
 _SHORT = {
     "too_plain": "plain",
     "unrelated": "other scene",
+    "stacked": "eyes stacked",
     "same_picture": "flat",
     "vertical_shift": "rows",
     "not_rectified": "rows",

@@ -30,6 +30,7 @@ _NAMED_SHOTS, _NAMED_PROBLEMS = 6, 3
 _WORDS = {
     "too_plain": "too plain to be checked",
     "unrelated": "the eyes show different scenes",
+    "stacked": "one eye is above the other",
     "same_picture": "flat: both eyes show the same picture",
     "swapped": "left and right are swapped",
     "vertical_shift": "the eyes' rows are apart",

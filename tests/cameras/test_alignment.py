@@ -5,8 +5,11 @@ import numpy as np
 import pytest
 
 from stereoweave.cameras.alignment import DEFECTS, check_pair
+from stereoweave.cameras.auto_align import align
+from stereoweave.errors import StereoweaveError
 from stereoweave.io.images import read_image, read_pair
 from stereoweave.learn.data.collage import paint_collage
+from stereoweave.stereo import StereoPair
 
 TEXTURED = Path(__file__).resolve().parents[1] / "textured_pair"
 SEED = 77
@@ -151,3 +154,17 @@ def test_a_strip_of_a_picture_is_checked_like_any_other(rng, size):
     left = np.zeros((*size, 3), np.uint8)
     left[:1000, :1000] = rng.integers(0, 256, left[:1000, :1000].shape, dtype=np.uint8)
     assert set(check_pair(left, np.roll(left, -4, axis=1)).defects) <= set(DEFECTS)
+
+
+def test_a_pair_turned_by_90_degrees_is_recognised():
+    example = read_pair(TEXTURED / "left.png", TEXTURED / "right.png")
+    left, right = (np.ascontiguousarray(np.rot90(image)) for image in (example.left, example.right))
+    found = check_pair(left, right)
+    assert found.defects == ("stacked",)
+    assert not found.is_known
+    (note,) = found.lines()
+    assert str(note).endswith("both pictures are turned; rotate both pictures by 90 degrees")
+    pair = StereoPair(left=left, right=right)
+    assert align(pair).pair is pair
+    with pytest.raises(StereoweaveError, match="one camera stood above the other"):
+        align(pair, always=True)
