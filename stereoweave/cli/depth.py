@@ -220,6 +220,7 @@ def measure(  # noqa: PLR0913 - each is an option of the command line
     The points are pixels of the left picture or, with --rectify, of the rectified left picture. The
     uncertainty of the distance is reported too.
     """
+    from stereoweave.cameras.diagnosis import find_problems
     from stereoweave.matching.backend import Backend
     from stereoweave.matching.estimate import match
     from stereoweave.matching.options import MatchOptions
@@ -237,8 +238,12 @@ def measure(  # noqa: PLR0913 - each is an option of the command line
     matcher = Backend(model=model, threads=threads, provider=provider).matcher()
     estimate = match(matcher, prepared.pair, options)
     error = CameraError(focal=focal_error_percent / 100, baseline=baseline_error_percent / 100)
-    found = distance(estimate, camera, *places, camera_error=error)
-    notes = [note.format(running_options()) for note in prepared.notes]
+    problems = find_problems(prepared.pair, estimate, prepared.alignment, prepared.remedy)
+    notes = [note.format(running_options()) for note in (*prepared.notes, *problems)]
+    try:
+        found = distance(estimate, camera, *places, camera_error=error)
+    except StereoweaveError as failed:
+        raise (failed.with_detail("; ".join(notes)) if notes else failed) from failed
     if as_json:
         typer.echo(json.dumps(asdict(found) | {"notes": notes}, indent=2, allow_nan=False))
     else:

@@ -116,6 +116,14 @@ def test_a_pair_is_not_rectified_into_a_folder_to_which_another_command_writes(t
     assert not list(tmp_path.iterdir())
 
 
+def test_a_measurement_in_a_pair_out_of_line_says_so(turned, capsys):
+    points = ["--from", "200,200", "--to", "400,300", "--focal-px", "600", "--baseline-m", "0.1"]
+    assert main(["measure", LEFT, turned, *points, "--model", "small"]) == 0
+    assert "rotated" in capsys.readouterr().out
+    assert main(["measure", RIGHT, LEFT, *points, "--model", "small"]) == 2
+    assert "left and right are swapped" in capsys.readouterr().err
+
+
 def test_depth_and_view_rectify_a_pair_out_of_line_unless_told_otherwise(turned, tmp_path, capsys):
     # The network does not matter to what is said, and the default ones take long.
     quick = ["--model", "small"]
