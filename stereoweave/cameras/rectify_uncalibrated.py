@@ -1,5 +1,6 @@
 """Rectification without a calibration, from feature matches."""
 
+import math
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -188,9 +189,10 @@ def _fit_again(cameras: CameraFit, found: Matches, within_px: float) -> CameraFi
 def _require_enough(found: Matches, right_ones: Bool[np.ndarray, " n"]) -> Matches:
     """Return the matches that agree; raise a StereoweaveError if there are too few."""
     count = len(right_ones)
-    if right_ones.sum() < max(_LEAST_MATCHES, _LEAST_RIGHT_SHARE * count):
+    needed = max(_LEAST_MATCHES, math.ceil(_LEAST_RIGHT_SHARE * count))
+    if right_ones.sum() < needed:
         raise StereoweaveError(
-            f"expected at least {_LEAST_MATCHES} feature matches that agree on the camera positions, "
+            f"expected at least {needed} feature matches that agree on the camera positions, "
             f"found {right_ones.sum()} of {count} matches; "
             "photograph a scene with more texture and with more overlap",
             setting="rectify",
