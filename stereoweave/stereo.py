@@ -166,8 +166,8 @@ class Estimate:
         occluded: Mask, bool, of the pixels that only the left camera sees.
         pair: The pair that the estimate belongs to, if `estimate` aligned it or opened it from one file; None
             if the estimate belongs to the images as given.
-        notes: Notes on how `estimate` opened or aligned the pair, or why it could not align it, and on its
-            other problems; `str` gives their text.
+        notes: Notes on how `estimate` opened or aligned the pair, or why it could not align it, and on other
+            problems, such as a range that is too narrow; `str` gives their text.
     """
 
     disparity_px: Float[np.ndarray, "h w"]

@@ -239,7 +239,7 @@ def measure(  # noqa: PLR0913 - each is an option of the command line
     estimate = match(matcher, prepared.pair, options)
     error = CameraError(focal=focal_error_percent / 100, baseline=baseline_error_percent / 100)
     problems = find_problems(prepared.pair, estimate, prepared.alignment, prepared.remedy)
-    notes = [note.format(running_options()) for note in (*prepared.notes, *problems)]
+    notes = [note.format(running_options()) for note in (*prepared.notes, *estimate.notes, *problems)]
     try:
         found = distance(estimate, camera, *places, camera_error=error)
     except StereoweaveError as failed:

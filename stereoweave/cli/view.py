@@ -193,7 +193,8 @@ def _render(
     else:
         written = file.write(pair, estimate, prepared.pictures)
     typer.echo(f"{file.path}: {written.description}")
-    _print_notes([*prepared.notes, *find_problems(pair, estimate, prepared.alignment, prepared.remedy)])
+    problems = find_problems(pair, estimate, prepared.alignment, prepared.remedy)
+    _print_notes([*prepared.notes, *estimate.notes, *problems])
 
 
 def _print_notes(notes: Sequence[Note]) -> None:

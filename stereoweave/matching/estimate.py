@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
-from stereoweave.errors import StereoweaveError
+from stereoweave.errors import Note, Remedy, StereoweaveError
 from stereoweave.io.images import SMALLEST_SIDE_PX
 from stereoweave.matching.disparity_range import find_range, goes_beyond
 from stereoweave.matching.edge_vote.vote import rehearse_voting
@@ -39,6 +39,7 @@ _DOUBTFUL_PERCENT = 1.0
 _MARGIN_PX = 4
 # Disparities that are outside a given range by more than this are wrong, not just rounded.
 _OUTSIDE_PX = 1
+_TOLERATED_OUTSIDE_PERCENT = 5.0
 # Only this share of PIXEL_PAIRS_AT_ONCE is usable, because the number of rows is rounded to a multiple.
 _FILLED = 0.95
 # Greatest combined rounding error of width and shift.
@@ -366,13 +367,22 @@ def _pad_columns(image: np.ndarray, before: int, behind: int) -> np.ndarray:
 
 
 def _clip(found: Estimate, low_px: float, high_px: float) -> Estimate:
-    """Clip disparities to a range; pixels outside it by more than _OUTSIDE_PX get confidence 0."""
-    outside_px = np.maximum(low_px - found.disparity_px, found.disparity_px - high_px)
+    """Clip disparities to a range; pixels outside it by more than _OUTSIDE_PX get confidence 0.
+
+    The estimate gets a note if they are many.
+    """
+    outside = np.maximum(low_px - found.disparity_px, found.disparity_px - high_px) > _OUTSIDE_PX
+    outside_percent = 100 * float(outside.mean())
+    cut = Note(
+        f"{outside_percent:.0f} % of the disparities are outside the range of {low_px:g} to {high_px:g} px",
+        Remedy("widen it, or leave it out", ("range_px",)),
+    )
     return replace(
         found,
+        notes=(*found.notes, cut) if outside_percent > _TOLERATED_OUTSIDE_PERCENT else found.notes,
         disparity_px=np.clip(found.disparity_px, low_px, high_px),
         right_disparity_px=np.clip(found.right_disparity_px, low_px, high_px),
-        confidence=np.where(outside_px > _OUTSIDE_PX, np.float32(0), found.confidence),
+        confidence=np.where(outside, np.float32(0), found.confidence),
     )
 
 

@@ -111,7 +111,7 @@ def run_many(prepared: Sequence[Prepared], matcher: Matcher, options: MatchOptio
                 model=model,
                 estimate_ms=total_ms / len(prepared),
             ),
-            notes=each.notes,
+            notes=(*each.notes, *estimate.notes),
             threads=matcher.threads,
             alignment=each.alignment,
             remedy=each.remedy,

@@ -77,7 +77,7 @@ def estimate(  # noqa: PLR0913 - all but the images are keyword-only and optiona
     if right is None:
         prepared = _open_both(left, sphere, aligned=bool(align))
         found = match(backend.matcher(), prepared.pair, options)
-        notes = _fit_to_python(prepared.notes)
+        notes = (*_fit_to_python(prepared.notes), *found.notes)
         if align:
             notes += tuple(find_problems(prepared.pair, found, prepared.alignment, _RECTIFY_FIRST))
         return replace(found, pair=prepared.pair, notes=notes)
@@ -100,7 +100,7 @@ def _match_images(
     ready = auto_align.align(given)
     found = match(matcher, ready.pair, options)
     problems = find_problems(ready.pair, found, ready.alignment, _RECTIFY_FIRST)
-    notes = _fit_to_python((*ready.notes, *problems))
+    notes = (*_fit_to_python((*ready.notes, *problems)), *found.notes)
     is_given = ready.pair is given and not chosen
     return replace(found, pair=None if is_given else ready.pair, notes=notes)
 

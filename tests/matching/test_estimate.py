@@ -118,6 +118,12 @@ def flat(rng, disparity_px, size=(160, 480)):
     )
 
 
+def test_a_range_that_cuts_off_much_of_the_scene_is_noted(matcher, rng):
+    (note,) = match(matcher, flat(rng, 37), MatchOptions(range_px=(0, 20))).notes
+    assert str(note).endswith("outside the range of 0 to 20 px; widen it, or leave it out (range_px)")
+    assert match(matcher, flat(rng, 37), MatchOptions(range_px=(0, 60))).notes == ()
+
+
 @pytest.mark.parametrize("range_px", [(0, 300), (0, 500), (-200, 200), (None)])
 def test_a_disparity_of_37_px_is_37_px_however_much_the_pair_is_reduced(matcher, rng, range_px):
     found = match(matcher, flat(rng, 37), MatchOptions(range_px=range_px))
