@@ -31,7 +31,10 @@ def has_vertical_baseline(found: Matches, scale: float) -> bool:
 
 
 def _measure_parallax(found: Matches, offsets_px: Float[np.ndarray, " n"]) -> float:
-    """Return how far offsets differ from a plane, which a shift, a rotation, a scale and a slant are."""
+    """Return how much the offsets vary about their best plane.
+
+    The plane removes what a shift, a rotation, a difference in scale and a slanted scene cause.
+    """
     places = np.column_stack([found.left_px, np.ones(len(offsets_px))])
     kept = np.ones(len(offsets_px), bool)
     for _ in range(_FITS):

@@ -243,7 +243,9 @@ def measure(  # noqa: PLR0913 - each is an option of the command line
     try:
         found = distance(estimate, camera, *places, camera_error=error)
     except StereoweaveError as failed:
-        raise (failed.with_detail("; ".join(notes)) if notes else failed) from failed
+        if not notes:
+            raise
+        raise failed.with_detail("; ".join(notes)) from failed
     if as_json:
         typer.echo(json.dumps(asdict(found) | {"notes": notes}, indent=2, allow_nan=False))
     else:

@@ -49,13 +49,13 @@ CheckedScreen = Annotated[
         "depth than it shows without strain is then a problem; so are near objects that a border cuts off.",
     ),
 ]
-# The first file marks an earlier result; see `replacing_together`.
-_RECTIFIED = ("left.png", "right.png", "calib.yml")
-
 Timeline = Annotated[
     Path | None,
     typer.Option(metavar="PICTURE", help="Picture to write of the video's depth and problems over time."),
 ]
+
+# The first file marks an earlier result; see `replacing_together`.
+_RECTIFIED = ("left.png", "right.png", "calib.yml")
 
 
 @shows_steps
@@ -77,7 +77,6 @@ def check(  # noqa: PLR0913 - each is an option of the command line
     eyes and near objects that a border cuts off, shot by shot. The exit status is 1 if there is a problem.
     """
     from stereoweave.cameras.alignment import check_pair
-    from stereoweave.io.files import refuse_inputs
     from stereoweave.pictures.loading import open_pictures
     from stereoweave.video.reader import open_video
 
@@ -90,8 +89,6 @@ def check(  # noqa: PLR0913 - each is an option of the command line
         opened = None
     if opened is None:
         name = ", ".join(picture.name for picture in pictures)
-        if timeline is not None:
-            refuse_inputs([timeline], pictures)
         print_video_check(open_video(pictures, format, sphere=sphere), name, screen, timeline, as_json)
         return
     refuse_video_options(screen, timeline)

@@ -21,7 +21,8 @@ def replacing_together(out: Path, names: Sequence[str], written: Sequence[str]) 
     Args:
         out: Folder of the result; made if it is missing.
         names: All files that a result can have.
-        written: The files that this result has, which must not be there without the first name.
+        written: The files that this result has. One that exists without the first name is the user's, and an
+            error.
 
     Raises:
         OutputInUseError: Another process writes to `out`.
