@@ -64,6 +64,8 @@ CAPABILITIES = {
 
 # The value that `ray_engine.set_environment` sets before it imports Ray; tests import Ray earlier.
 os.environ["RAY_DEDUP_LOGS_SKIP_REGEX"] = ".*"
+# PyTorch reads it when it is imported. Its exporter takes a sixth less time without this cache.
+os.environ["TORCH_FAKE_TENSOR_DISPATCH_CACHE"] = "0"
 
 # Stereoweave sets it to 0 when it starts Ray itself. A cluster started with it would listen only on the
 # loopback address, but the processes of the tests have imported Ray without it, and expect another address.
