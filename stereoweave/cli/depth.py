@@ -210,7 +210,7 @@ def measure(  # noqa: PLR0913 - each is an option of the command line
     lens_fov: LensFov = None,
     range_px: Range = None,
     refined: Refined = False,
-    model: Model = "base",
+    model: Model = "best",
     threads: Threads = None,
     provider: Provider = "cpu",
     as_json: AsJson = False,

@@ -132,7 +132,7 @@ def view(  # noqa: PLR0913 - each is an option of the command line
     lens_fov: LensFov = None,
     whole: Whole = False,
     range_px: Range = None,
-    model: Model = "base",
+    model: Model = "best",
     threads: Threads = None,
     provider: Provider = "cpu",
 ) -> None:

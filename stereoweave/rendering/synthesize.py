@@ -15,7 +15,7 @@ def synthesize(  # noqa: PLR0913 - all but the first three are optional
     left: ImageLike,
     right: ImageLike,
     position: float,
-    model: str | Path = "base",
+    model: str | Path = "best",
     threads: int | None = None,
     *,
     provider: str = CPU,
@@ -26,8 +26,8 @@ def synthesize(  # noqa: PLR0913 - all but the first three are optional
         left: Left image, as for `estimate`: path, PIL image, array or tensor.
         right: Right image of the same size.
         position: Position from -1 to 2; 0 is the left camera and 1 the right one.
-        model: See `estimate`. The default is the accurate model, because a new view shows every error at an
-            edge.
+        model: See `estimate`. The default is the most accurate one, because a new view shows every error at
+            an edge. For many views of a pair, estimate once and use a `Renderer`.
         threads: Number of threads; default: all cores.
         provider: See `estimate`.
 

@@ -46,7 +46,7 @@ def test_a_quilt_of_48_views_matches_once(pair, monkeypatch, capfd):
         return estimate_many(matcher, pairs, **options)
 
     monkeypatch.setattr(Matcher, "estimate_many", counted)
-    assert run("view left.png right.png --layout quilt --threads 1 -o view.png") == 0
+    assert run("view left.png right.png --layout quilt --model base --threads 1 -o view.png") == 0
     # The notes take two more matches, at half the size.
     assert sizes.count((64, 95)) == 1
     assert set(sizes[1:]) <= {(32, 47)}

@@ -19,7 +19,7 @@ def pair(rng):
 
 def test_synthesizing_is_estimating_and_then_rendering(pair):
     view = synthesize(*pair, position=0.3)
-    expected = render(*pair, estimate(*pair, model="base", refined=True), 0.3)
+    expected = render(*pair, estimate(*pair, model="best"), 0.3)
     np.testing.assert_array_equal(view.image, expected.image)
     np.testing.assert_array_equal(view.drawn, expected.drawn)
 
@@ -57,5 +57,5 @@ def test_a_view_is_closer_to_a_real_picture_from_between_than_a_blend(testdata):
 
 def test_render_is_still_the_function_after_synthesize_was_used(pair):
     view = sw.synthesize(*pair, position=0.5)
-    again = sw.render(*pair, sw.estimate(*pair, model="base", refined=True), position=0.5)
+    again = sw.render(*pair, sw.estimate(*pair, model="best"), position=0.5)
     np.testing.assert_array_equal(again.image, view.image)
