@@ -65,3 +65,40 @@ def test_a_pair_of_a_vr180_camera_is_aligned(testdata):
     # The rows of the file are 2.6 px apart.
     found = check_pair(prepared.pair.left, prepared.pair.right)
     assert found.vertical_error_px < 0.3 and found.vertical_error_95_px < 1 and not found.defects
+
+
+def notes_on(**camera):
+    pictures = [TEXTURED / "left.png", TEXTURED / "right.png"]
+    return [str(note) for note in prepare(pictures, Request(**camera)).notes]
+
+
+@pytest.mark.parametrize(
+    ("baseline_m", "apart"), [(193.0, "193 m"), (5.5, "5.5 m"), (0.000193, "0.19 mm"), (0.0009, "0.9 mm")]
+)
+def test_a_baseline_in_a_wrong_unit_is_noted(baseline_m, apart):
+    assert notes_on(focal_px=600.0, baseline_m=baseline_m) == [
+        f"unlikely depths in metres: the cameras are {apart} apart; "
+        "check the unit of the baseline (calibration, baseline_m)"
+    ]
+
+
+def test_a_focal_length_in_millimetres_is_noted():
+    assert read_image(TEXTURED / "left.png").shape[1] == 640
+    # 320 px are 9.143 times 35 px, and the angle whose tangent is 9.143 is 83.76 degrees.
+    assert notes_on(focal_px=35.0, baseline_m=0.1) == [
+        "unlikely depths in metres: a focal length of 35 px means a field of view of 168 degrees; "
+        "check that the focal length is in pixels (calibration, focal_px)"
+    ]
+
+
+@pytest.mark.parametrize(("focal_px", "baseline_m"), [(150.0, 0.002), (5000.0, 4.0)])
+def test_a_wide_lens_and_a_long_rig_are_not_doubted(focal_px, baseline_m):
+    assert notes_on(focal_px=focal_px, baseline_m=baseline_m) == []
+
+
+def test_a_calibration_in_a_wrong_unit_is_noted(tmp_path):
+    calibration = tmp_path / "calib.txt"
+    camera = "[600 0 320; 0 600 240; 0 0 1]"
+    calibration.write_text(f"cam0={camera}\ncam1={camera}\ndoffs=0\nbaseline=0.193\nwidth=640\nheight=480\n")
+    (note,) = notes_on(calibration=calibration)
+    assert note.startswith("unlikely depths in metres: the cameras are 0.19 mm apart")
