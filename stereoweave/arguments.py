@@ -5,7 +5,8 @@ fast.
 """
 
 import reprlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from difflib import get_close_matches
 from numbers import Integral, Real
 from typing import TYPE_CHECKING, TypeGuard, cast
 
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     import numpy as np
 
 _MOST_SHOWN = 60
+_LEAST_LIKENESS = 0.7  # "gpu" is no slip for "cpu"
 _DTYPES = {"f": "floats", "u": "uint8", "b": "booleans"}
 
 
@@ -45,6 +47,25 @@ def as_two_numbers(
     for number in numbers:
         check_number(setting, number)
     return float(numbers[0]), float(numbers[1])
+
+
+def check_choice(
+    setting: str, value: object, choices: Iterable[str], kind: type[StereoweaveError] = StereoweaveError
+) -> None:
+    """Require one of the names in `choices`; the error, of class `kind`, suggests what was probably meant."""
+    names = list(choices)
+    if value not in names:
+        message = f"expected one of {', '.join(names)}, found {describe(value)}"
+        raise kind(message + suggest(value, names), setting=setting)
+
+
+def suggest(value: object, names: Sequence[str]) -> str:
+    """Return "; did you mean ...?" with names that begin with a value, resemble it or have its initials."""
+    typed = str(value).lower().replace("-", "_").replace(" ", "_")
+    longer = [typed] if typed in names else [name for name in names if typed and name.startswith(typed)]
+    by_initials = [name for name in names if "".join(part[0] for part in name.split("_")) == typed]
+    meant = longer or get_close_matches(typed, names, 1, _LEAST_LIKENESS) or by_initials
+    return f"; did you mean {' or '.join(meant)}?" if meant else ""
 
 
 def check_flag(name: str, value: object) -> None:

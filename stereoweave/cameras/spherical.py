@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float32
 
+from stereoweave.arguments import check_choice
 from stereoweave.errors import Remedy, StereoweaveError
 
 Rays = Float32[np.ndarray, "3 h w"]
@@ -72,13 +73,10 @@ class Projection:
     @classmethod
     def named(cls, name: str, lens_fov_deg: float = 180.0) -> "Projection":
         """Return the projection with this name, of a whole image. Raises StereoweaveError if unknown."""
+        check_choice("projection", name, (EQUIRECTANGULAR, HALF, FISHEYE))
         if name == HALF:
             return cls(name=HALF, yaw_deg=(-90.0, 90.0))
-        if name in (EQUIRECTANGULAR, FISHEYE):
-            return cls(name=name, lens_fov_deg=lens_fov_deg)
-        raise StereoweaveError(
-            f"expected one of {', '.join(PROJECTIONS)}, found {name!r}", setting="projection"
-        )
+        return cls(name=name, lens_fov_deg=lens_fov_deg)
 
     @property
     def turns(self) -> bool:
@@ -152,10 +150,8 @@ class SphereRequest:
     whole: bool = False
 
     def __post_init__(self) -> None:
-        if self.projection not in (None, *PROJECTIONS):
-            raise StereoweaveError(
-                f"expected one of {', '.join(PROJECTIONS)}, found {self.projection!r}", setting="projection"
-            )
+        if self.projection is not None:
+            check_choice("projection", self.projection, PROJECTIONS)
         for setting, value in (("look_deg", self.look_deg), ("fov_deg", self.fov_deg)):
             if self.whole and value is not None:
                 raise StereoweaveError(

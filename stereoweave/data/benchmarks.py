@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from stereoweave.arguments import check_choice
 from stereoweave.data.frames import list_scene_folders, match_files, require_folder
 from stereoweave.errors import FormatError, Note, Remedy, StereoweaveError
 from stereoweave.io.decoding import open_picture
@@ -90,10 +91,7 @@ def find_benchmark(root: str | Path, dataset: str | None = None) -> str:
         StereoweaveError: The name is unknown, or the folder contains no benchmark or several.
     """
     if dataset is not None:
-        if dataset not in BENCHMARKS:
-            raise StereoweaveError(
-                f"expected one of {', '.join(BENCHMARKS)}, found {dataset!r}", setting="dataset"
-            )
+        check_choice("dataset", dataset, BENCHMARKS)
         return dataset
     folder = require_folder(Path(root))
     found = [
@@ -182,10 +180,8 @@ def _list_middlebury(root: Path, choice: Choice) -> Iterator[BenchmarkPair]:
 
 
 def _find_resolution(base: Path, chosen: str | None) -> str:
-    if chosen is not None and chosen not in RESOLUTIONS:
-        raise StereoweaveError(
-            f"expected one of {', '.join(RESOLUTIONS)}, found {chosen!r}", setting="resolution"
-        )
+    if chosen is not None:
+        check_choice("resolution", chosen, RESOLUTIONS)
     found = [
         letter
         for letter in RESOLUTIONS

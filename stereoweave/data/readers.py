@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float32
 
+from stereoweave.arguments import check_choice
 from stereoweave.cameras.calibration_files import add_camera
 from stereoweave.data import eth3d, kitti, middlebury, paper_layout, scene_flow, shards, sintel
 from stereoweave.data.frames import Frame, require_folder
@@ -46,8 +47,7 @@ def open_dataset(name: str, root: str | Path) -> list[Frame]:
         StereoweaveError: The dataset is unknown, a folder is missing, or there are no frames.
         FormatError: A folder lacks a file that another has; a frame's `read` reports other missing files.
     """
-    if name not in DATASETS:
-        raise StereoweaveError(f"expected one of {', '.join(DATASETS)}, found {name!r}", setting="dataset")
+    check_choice("dataset", name, DATASETS)
     frames = DATASETS[name](require_folder(Path(root)))
     if not frames:
         raise StereoweaveError(f"{root}: expected the unpacked archives of {name}, found no frames")

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from stereoweave.arguments import check_choice
 from stereoweave.data.frames import Frame
 from stereoweave.errors import StereoweaveError
 
@@ -37,8 +38,7 @@ def split_frames(frames: list[Frame], dataset: str, split: str) -> tuple[list[Fr
 
 
 def _read_rule(dataset: str, split: str) -> dict[str, Any]:
-    if split not in SPLITS:
-        raise StereoweaveError(f"expected one of {', '.join(SPLITS)}, found {split!r}", setting="split")
+    check_choice("split", split, SPLITS)
     rules = tomllib.loads((files(__package__) / "split_rules" / f"{split}.toml").read_text(encoding="utf-8"))
     if dataset not in rules:
         raise StereoweaveError(f"dataset to split: expected one of {', '.join(rules)}, found {dataset!r}")

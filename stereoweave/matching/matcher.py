@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from stereoweave.arguments import check_kind
+from stereoweave.arguments import check_kind, suggest
 from stereoweave.errors import MatcherError, StereoweaveError
 from stereoweave.io.images import SMALLEST_SIDE_PX
 from stereoweave.matching.contrast import measure_contrast
@@ -365,8 +365,11 @@ def model_file(model: str | Path) -> Path:
         return path
     name = MODES[str(model)].network if str(model) in MODES else str(model)
     if name not in shipped_models():
-        names = ", ".join(dict.fromkeys([*shipped_models(), *MODES]))
-        raise MatcherError(f"unknown model {name!r}; expected {names} or the path of an .onnx file")
+        names = list(dict.fromkeys([*shipped_models(), *MODES]))
+        raise MatcherError(
+            f"unknown model {name!r}; expected {', '.join(names)} or the path of an .onnx file"
+            + suggest(name, names)
+        )
     return _weights_folder() / f"{name}.onnx"
 
 

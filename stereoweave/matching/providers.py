@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from stereoweave.arguments import check_kind
+from stereoweave.arguments import check_choice, check_kind
 from stereoweave.errors import MatcherError, ProviderError, Remedy
 
 CPU = "cpu"
@@ -122,8 +122,7 @@ def check_provider(provider: str) -> None:
     import onnxruntime  # type: ignore[import-untyped]
 
     check_kind("provider", provider, str)
-    if provider not in PROVIDERS:
-        raise MatcherError(f"expected one of {', '.join(PROVIDERS)}, found {provider!r}", setting="provider")
+    check_choice("provider", provider, PROVIDERS, MatcherError)
     there = [name for name, known in PROVIDERS.items() if known.name in onnxruntime.get_available_providers()]
     if provider not in there:
         raise MatcherError(

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
+from stereoweave.arguments import check_choice
 from stereoweave.cameras.spherical import Projection, SphereRequest
 from stereoweave.errors import FormatError, Note, Remedy, StereoweaveError
 from stereoweave.io import exif, heif, lif, vr180
@@ -93,8 +94,8 @@ def open_pictures(
         StereoweaveError: The layout is unknown or given for two files, or the number of files is neither one
             nor two.
     """
-    if format not in (None, *FORMATS):
-        raise StereoweaveError(f"expected one of {', '.join(FORMATS)}, found {format!r}", setting="format")
+    if format is not None:
+        check_choice("format", format, FORMATS)
     sphere = sphere or SphereRequest()
     match paths:
         case [left, right]:

@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from stereoweave.arguments import check_kind, check_number
+from stereoweave.arguments import check_choice, check_kind, check_number
 from stereoweave.errors import StereoweaveError
 from stereoweave.stereo import Estimate
 
@@ -147,8 +147,7 @@ def find_screen(name: str) -> Screen:
         StereoweaveError: There is no such screen.
     """
     check_kind("screen", name, str)
-    if name not in SCREENS:
-        raise StereoweaveError(f"expected one of {', '.join(SCREENS)}, found {name!r}", setting="screen")
+    check_choice("screen", name, SCREENS)
     return SCREENS[name]
 
 

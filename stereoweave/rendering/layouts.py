@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Num, UInt8
 from PIL import Image
 
+from stereoweave.arguments import check_choice
 from stereoweave.errors import Remedy, StereoweaveError
 from stereoweave.io.animation import check_animation_ending
 from stereoweave.io.colormap import find_colour_range_px
@@ -284,10 +285,8 @@ def choose_layout(path: str | Path, name: str | None) -> str | None:
     Raises:
         StereoweaveError: The layout is unknown or does not match the file extension.
     """
-    if name not in (None, *LAYOUTS, *ANIMATIONS, VIEWER):
-        raise StereoweaveError(
-            f"expected one of {', '.join([*LAYOUTS, *ANIMATIONS, VIEWER])}, found {name!r}", setting="layout"
-        )
+    if name is not None:
+        check_choice("layout", name, [*LAYOUTS, *ANIMATIONS, VIEWER])
     ending = Path(path).suffix.lower()
     held = _LAYOUT_BY_ENDING.get(ending)
     if held is not None:

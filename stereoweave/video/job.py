@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from math import isfinite
 
+from stereoweave.arguments import check_choice
 from stereoweave.errors import NameOf, Remedy, StereoweaveError, keyword
 from stereoweave.matching.backend import Backend
 from stereoweave.rendering.comfort import ScreenChoice
@@ -79,10 +80,8 @@ class VideoJob:
                 remedy=Remedy("choose side_by_side, which is marked for headsets"),
                 setting="layout",
             )
-        if self.layout not in (None, *LAYOUTS):
-            raise StereoweaveError(
-                f"expected one of {', '.join(LAYOUTS)}, found {self.layout!r}", setting="layout"
-            )
+        if self.layout is not None:
+            check_choice("layout", self.layout, LAYOUTS)
         if self.screen is not None:
             check_shows_depth(self.layout or given[0])
         self._check_numbers(given[0] if self.layout is None else f"layout {self.layout}")

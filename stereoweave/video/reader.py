@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import UInt8
 
+from stereoweave.arguments import check_choice
 from stereoweave.cameras.sphere_remap import Cutter
 from stereoweave.cameras.spherical import SphereRequest
 from stereoweave.errors import FormatError, Note, Remedy, StereoweaveError
@@ -225,10 +226,8 @@ def open_video(
         StereoweaveError: The frame packing is unknown, the number of paths is not one or two, a rate is given
             for a video, or PyAV is missing.
     """
-    if format not in (None, *FRAME_PACKINGS):
-        raise StereoweaveError(
-            f"expected one of {', '.join(FRAME_PACKINGS)}, found {format!r}", setting="format"
-        )
+    if format is not None:
+        check_choice("format", format, FRAME_PACKINGS)
     if not 1 <= len(paths) <= 2 or (len(paths) == 2 and format):
         raise StereoweaveError(
             "expected one video with both eyes, or a left and a right video without a frame packing, "

@@ -166,8 +166,8 @@ def test_a_photograph_with_an_offset_scores_as_the_referee_says(testdata, tmp_pa
     ]
     subprocess.run(program, check=True, capture_output=True)
     referee = json.loads((tmp_path / "found.json").read_text())["cones"]
-    makers = {"base refined": partial(make_matcher, "base", refined=True)}
+    makers = {"best": partial(make_matcher, "best")}
     found = by_method(score_view_scenes(makers, partial(list_view_scenes, tmp_path)).rows, "cones")
-    for method, name in (("nearest photograph",) * 2, ("cross-fade",) * 2, ("base refined", "stereoweave")):
+    for method, name in (("nearest photograph",) * 2, ("cross-fade",) * 2, ("best", "stereoweave")):
         assert found[method].psnr_db == pytest.approx(referee[name]["psnr"], abs=1e-6)
         assert found[method].ssim == pytest.approx(referee[name]["ssim"], abs=1e-6)

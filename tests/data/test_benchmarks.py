@@ -102,7 +102,10 @@ def test_an_unknown_folder_an_unknown_name_and_two_benchmarks_in_one_folder_are_
     assert "with the folder testing/image_0 or testing/image_2 or" in error_of(find_benchmark, tmp_path)
     assert "found no such folder" in error_of(find_benchmark, tmp_path / "nowhere")
     message = error_of(find_benchmark, tmp_path, "kitti")
-    assert message == "dataset: expected one of kitti2012, kitti2015, middlebury_v3, eth3d, found 'kitti'"
+    assert message == (
+        "dataset: expected one of kitti2012, kitti2015, middlebury_v3, eth3d, found 'kitti'; "
+        "did you mean kitti2012 or kitti2015?"
+    )
     write_kitti(tmp_path, "kitti2012")
     write_kitti(tmp_path, "kitti2015")
     message = error_of(find_benchmark, tmp_path)

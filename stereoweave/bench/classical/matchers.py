@@ -2,11 +2,11 @@
 
 import numpy as np
 
+from stereoweave.arguments import check_choice
 from stereoweave.bench.classical.scanlines import match_scanlines
 from stereoweave.bench.classical.spanning_trees import match_spanning_trees
 from stereoweave.bench.classical.windows import match_windows
 from stereoweave.bench.opencv_matchers import MapMatch
-from stereoweave.errors import StereoweaveError
 from stereoweave.stereo import StereoPair
 
 CLASSICAL_MATCHERS: dict[str, MapMatch] = {
@@ -23,9 +23,7 @@ def make_classical_matcher(name: str) -> MapMatch:
     Raises:
         StereoweaveError: There is none of that name.
     """
-    if name not in CLASSICAL_MATCHERS:
-        known = ", ".join(CLASSICAL_MATCHERS)
-        raise StereoweaveError(f"expected one of {known}, found {name!r}", setting="matchers")
+    check_choice("matchers", name, CLASSICAL_MATCHERS)
     return CLASSICAL_MATCHERS[name]
 
 

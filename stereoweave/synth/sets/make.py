@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from rich.console import Console
 
+from stereoweave.arguments import check_choice
 from stereoweave.data.packing import pack
 from stereoweave.data.paper_layout import list_complete_frames, remove_unfinished, write_frame
 from stereoweave.data.poses import POSES_FOLDER, write_poses
@@ -191,8 +192,7 @@ def _check_facts(path: Path, facts: dict[str, Any]) -> None:
 
 
 def _check(spec: RenderSpec, pairs: int, layout: str) -> None:
-    if layout not in LAYOUTS:
-        raise StereoweaveError(f"expected one of {', '.join(LAYOUTS)}, found {layout!r}", setting="layout")
+    check_choice("layout", layout, LAYOUTS)
     least = {"pairs": (pairs, 1), "seed": (spec.seed, 0), "frames": (spec.frames, 1)}
     for name, (value, smallest) in least.items():
         if value < smallest:

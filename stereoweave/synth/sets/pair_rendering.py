@@ -9,6 +9,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from stereoweave.arguments import check_choice
 from stereoweave.data.poses import Pose
 from stereoweave.data.samples import make_sample
 from stereoweave.errors import StereoweaveError
@@ -78,8 +79,7 @@ class RenderSpec:
     distance_m: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        if self.scene not in SCENES:
-            raise StereoweaveError(f"scene: expected one of {', '.join(SCENES)}, found {self.scene!r}")
+        check_choice("scene", self.scene, SCENES)
         if self.distance_m is not None:
             _check_distance(self.distance_m, self.by_world)
         if self.rig is not None:

@@ -1,0 +1,41 @@
+"""Names that are no choice of a setting."""
+
+import pytest
+
+from stereoweave.arguments import check_choice
+from stereoweave.errors import MatcherError, StereoweaveError
+
+LAYOUTS = ["side_by_side", "side_by_side_half", "top_bottom", "wiggle"]
+
+
+@pytest.mark.parametrize(
+    ("typed", "meant"),
+    [
+        ("side-by-side", "side_by_side"),
+        ("Top Bottom", "top_bottom"),
+        ("wigle", "wiggle"),
+        ("side", "side_by_side or side_by_side_half"),
+        ("sbs", "side_by_side"),
+        ("TB", "top_bottom"),
+    ],
+)
+def test_the_name_that_was_probably_meant_is_suggested(typed, meant):
+    with pytest.raises(StereoweaveError) as refused:
+        check_choice("layout", typed, LAYOUTS)
+    assert str(refused.value) == (
+        "layout: expected one of side_by_side, side_by_side_half, top_bottom, wiggle, "
+        f"found {typed!r}; did you mean {meant}?"
+    )
+
+
+@pytest.mark.parametrize("typed", ["gpu", "xyz", "", None, 3, ["horse"]])
+def test_nothing_is_suggested_for_what_resembles_no_name(typed):
+    with pytest.raises(MatcherError) as refused:
+        check_choice("layout", typed, LAYOUTS, MatcherError)
+    assert str(refused.value) == (
+        f"layout: expected one of side_by_side, side_by_side_half, top_bottom, wiggle, found {typed!r}"
+    )
+
+
+def test_a_choice_is_accepted():
+    check_choice("layout", "wiggle", LAYOUTS)
