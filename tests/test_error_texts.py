@@ -43,8 +43,7 @@ OTHERS = {
 ERRORS = {
     "left.png: expected a stereo picture, two views side by side or one above the other, found what "
     "looks like a single photograph (its halves do not resemble each other); give two files, left and right; "
-    "or choose one of "
-    f"{LAYOUTS} (format)": lambda: open_pictures(PAIR[:1]),
+    "or choose its layout, such as side_by_side (format)": lambda: open_pictures(PAIR[:1]),
     f"format: expected one of {LAYOUTS}, mpo, jps, found 'diagonal'": lambda: open_pictures(
         PAIR[:1], "diagonal"
     ),
@@ -102,7 +101,7 @@ def test_a_note_names_settings_by_their_keyword(folder):
         "the right picture is 2.0 px lower than the left one; rectify the pair (rectify)"
     ]
     assert list(map(str, open_pictures([Path("both.png")]).notes)) == [
-        "side_by_side, detected from name and content; override it if it is wrong (format)"
+        "side_by_side, detected; override it if it is wrong (format)"
     ]
 
 

@@ -227,7 +227,7 @@ def _open_one(path: Path, format: str | None, sphere: SphereRequest) -> Opened:
     image = decoded.upright(lies)
     if name is None:
         name = _detect_picture_layout(path, image, has_depth=has_depth)
-        why = "detected from name and content"
+        why = "detected"
     if not format or sphere.projection is not None:
         named = None if vr180.is_panorama(xmp) else str(path)
         name = panoramas.choose_layout(name, named, (image.shape[1], image.shape[0]), sphere)

@@ -149,7 +149,7 @@ def detect_layout(
         raise FormatError(
             f"{name}: expected two views side by side, or the left one above the right one, found a video "
             f"that declares {declared}",
-            remedy=Remedy(f"if that is wrong, choose one of {', '.join(PAIR_LAYOUTS)}", ("format",)),
+            remedy=Remedy("if that is wrong, choose its layout, such as side_by_side", ("format",)),
         )
     if declared in INTERLEAVED_LAYOUTS:
         return str(declared)
@@ -237,10 +237,11 @@ def _detect_by_content(name: str, frames: Sequence[Frame], photograph: bool) -> 
     best = max(alike, key=lambda kind: np.nan_to_num(alike[kind], nan=-1))
     if alike[best] >= _ALIKE:
         return best
+    example = "side_by_side"
     if np.isnan(alike[best]):
         found = "a picture that is too plain to tell; give two files, left and right"
     elif woven := suspect_interleaving(frames[len(frames) // 2]):
-        found = f"what looks like {woven}, or a frame of interlaced video in motion"
+        found, example = f"what looks like {woven}, or a frame of interlaced video in motion", woven
     elif not photograph:
         found = "halves that do not resemble each other; give two files, left and right"
     elif looks_like_anaglyph(frames[0]):
@@ -253,7 +254,7 @@ def _detect_by_content(name: str, frames: Sequence[Frame], photograph: bool) -> 
     expected = "a stereo picture" if photograph else "a 3-D video"
     raise FormatError(
         f"{name}: expected {expected}, two views side by side or one above the other, found {found}",
-        remedy=Remedy(f"or choose one of {', '.join(PAIR_LAYOUTS)}", ("format",)),
+        remedy=Remedy(f"or choose its layout, such as {example}", ("format",)),
     )
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from error_examples import LAYOUTS, write_error_examples
+from error_examples import write_error_examples
 from page_examples import Visitor, file_data, start, stop
 from video_examples import example_pairs, packed, write_video
 
@@ -32,8 +32,7 @@ TWO_VIDEOS = {"video-left": "sbs.mp4", "video-right": "sbs.mp4"}
 ERRORS: dict[str, tuple[dict[str, str], dict[str, Any]]] = {
     "left.png: expected a stereo picture, two views side by side or one above the other, found what "
     "looks like a single photograph (its halves do not resemble each other); give two files, left and right; "
-    "or choose one of "
-    f"{LAYOUTS.replace('_', ' ')} (“Layout of a single file”)": ({"left": "left.png"}, {}),
+    "or choose its layout, such as side by side (“Layout of a single file”)": ({"left": "left.png"}, {}),
     "“Layout of a single file”: expected one picture that holds both views, found two, left.png and "
     "right.png; omit this setting, and give the left picture first": (PAIR, {"layout": "crossed"}),
     "turned.yml: expected a calibration of rectified pictures, found lenses with distortion; rectify the "
@@ -103,7 +102,7 @@ VIDEO_ERRORS: dict[str, tuple[dict[str, str], dict[str, Any]]] = {
     ),
 }
 NOTES: dict[str, tuple[dict[str, str], dict[str, Any]]] = {
-    "side by side, detected from name and content; override it if it is wrong (“Layout of a single file”)": (
+    "side by side, detected; override it if it is wrong (“Layout of a single file”)": (
         {"left": "both.png"},
         {},
     ),

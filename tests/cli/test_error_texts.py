@@ -19,7 +19,7 @@ PICTURE = "a picture (PNG, JPEG, TIFF or the like)"
 ERRORS = {
     "depth left.png -o out": "left.png: expected a stereo picture, two views side by side or one above the "
     "other, found what looks like a single photograph (its halves do not resemble each other); give two "
-    f"files, left and right; or choose one of {LAYOUTS} (--format)",
+    "files, left and right; or choose its layout, such as side_by_side (--format)",
     f"depth {PAIR} --format crossed -o out": "--format: expected one picture that holds both views, found "
     "two, left.png and right.png; omit this setting, and give the left picture first",
     "view both.png --format diagonal -o out.png": f"--format: expected one of {LAYOUTS}, mpo, jps, found "
@@ -99,7 +99,7 @@ ERRORS = {
     "--depth10, --depth16, --position, --layout)",
     "video plain.png --depth -o out.mp4": "plain.png: expected a 3-D video, two views side by side or one "
     "above the other, found a picture that is too plain to tell; give two files, left and right; or choose "
-    f"one of {LAYOUTS} (--format)",
+    "its layout, such as side_by_side (--format)",
     "video plain.png --depth --format diagonal -o out.mp4": f"--format: expected one of {LAYOUTS}, "
     "frame_sequential, frame_sequential_right_first, two_streams, two_streams_right_first, found 'diagonal'",
     "synth make pylon --pairs 1 --size 8x8 -o set": "--size: expected 32 to 4096 px per side, found 8x8",
@@ -112,7 +112,7 @@ ERRORS = {
 NOTES = {
     "check upper.png lower.png": "depth and view rectify such a pair by themselves; stereoweave rectify "
     "writes its pictures",
-    "check both.png": "side_by_side, detected from name and content; override it if it is wrong (--format)",
+    "check both.png": "side_by_side, detected; override it if it is wrong (--format)",
     "check right.png left.png": "left and right are swapped; give them the other way round",
     "depth inwards_left.png inwards_right.png --focal-px 640 --baseline-m 0.1 --rectify --model small "
     "-o out": "no depth in metres: rectification from feature matches did not find the cameras parallel; "

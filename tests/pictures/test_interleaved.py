@@ -92,7 +92,7 @@ def test_a_suspected_one_is_refused_with_its_name(tmp_path, eyes, kind, ending):
     Image.fromarray(interleaved(*eyes, kind)).save(path)
     message = refusal(path)
     assert f"found what looks like {kind}, or a frame of interlaced video in motion" in message
-    assert "or choose one of side_by_side" in message
+    assert f"or choose its layout, such as {kind}" in message
     assert "(format)" in message
 
 

@@ -398,9 +398,7 @@ def test_upright_views_beside_each_other_are_not_taken_for_squeezed_ones(tmp_pat
 def test_a_guess_is_told_and_how_to_overrule_it(tmp_path, pair):
     write_image(tmp_path / "view.png", np.hstack([pair.left, pair.right]))
     opened = open_pictures([tmp_path / "view.png"])
-    assert list(map(str, opened.notes)) == [
-        "side_by_side, detected from name and content; override it if it is wrong (format)"
-    ]
+    assert list(map(str, opened.notes)) == ["side_by_side, detected; override it if it is wrong (format)"]
     assert_eyes(opened, pair)
     assert open_pictures([tmp_path / "view.png"], "side_by_side").notes == ()
 
@@ -431,7 +429,7 @@ def test_an_ordinary_photograph_is_refused_with_what_to_do(tmp_path, photograph)
         "found what looks like a single photograph (its halves do not resemble each other); give two"
         in message
     )
-    assert "; give two files, left and right; or choose one of side_by_side, " in message
+    assert "; give two files, left and right; or choose its layout, such as side_by_side" in message
     assert message.endswith(" (format)")
 
 
@@ -444,7 +442,7 @@ def test_an_anaglyph_is_named(tmp_path, pair, kind, order):
     assert (
         "found an anaglyph, which mixes both views into one picture; give the two pictures it was" in message
     )
-    assert message.endswith("column_interleaved_right_first, checkerboard_right_first (format)")
+    assert message.endswith("; or choose its layout, such as side_by_side (format)")
 
 
 @pytest.mark.parametrize("photograph", ["astronaut", "coffee", "chelsea", "rocket", "retina", "colorwheel"])

@@ -60,7 +60,7 @@ def test_a_converged_lens_gives_no_metres(testdata):
 @pytest.mark.testdata
 def test_a_pair_of_a_vr180_camera_is_aligned(testdata):
     prepared = prepare([testdata / "consumer" / "calf-left-right.jpg"], Request())
-    assert str(prepared.notes[0]).startswith("side_by_side, detected from name and content")
+    assert str(prepared.notes[0]).startswith("side_by_side, detected")
     assert prepared.pair.left.shape == (1080, 1920, 3)
     # The rows of the file are 2.6 px apart.
     found = check_pair(prepared.pair.left, prepared.pair.right)

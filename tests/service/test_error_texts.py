@@ -8,7 +8,7 @@ from typing import Any
 
 import httpx
 import pytest
-from error_examples import LAYOUTS, write_error_examples
+from error_examples import write_error_examples
 
 from stereoweave.matching.matcher import Matcher
 from stereoweave.service.answers import ServiceAnswer, ServiceJob, answer_many
@@ -23,7 +23,7 @@ Ask = Callable[..., httpx.Response]
 ERRORS: dict[str, tuple[str, dict[str, str], dict[str, Any]]] = {
     "picture: expected a stereo picture, two views side by side or one above the other, found what looks "
     "like a single photograph (its halves do not resemble each other); give two files, left and right; or "
-    f"choose one of {LAYOUTS} (format)": (
+    "choose its layout, such as side_by_side (format)": (
         "/disparity",
         {"picture": "left.png"},
         {},
@@ -60,7 +60,7 @@ NOTES: dict[str, tuple[dict[str, str], dict[str, Any]]] = {
         LOWER,
         {"check": True},
     ),
-    "side_by_side, detected from name and content; override it if it is wrong (format)": (
+    "side_by_side, detected; override it if it is wrong (format)": (
         {"picture": "both.png"},
         {},
     ),

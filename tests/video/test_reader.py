@@ -115,7 +115,7 @@ def test_an_unsupported_declared_frame_packing_is_named(tmp_path):
     assert count
     path.write_bytes(changed)
     assert "video.mp4: " in refusal(path)
-    declared = "declares side_by_side_quincunx; if that is wrong, choose one of side_by_side, "
+    declared = "declares side_by_side_quincunx; if that is wrong, choose its layout, such as side_by_side"
     assert declared in refusal(path)
     assert open_video([path], "side_by_side").frame_count == 2
 
