@@ -144,6 +144,13 @@ def test_a_large_picture_is_thinned_to_every_nth_pixel():
     assert (wall.step_px, len(wall.faces)) == (3, 2 * 13 * 19)
 
 
+@pytest.mark.parametrize("make", [make_point_cloud, make_mesh])
+@pytest.mark.parametrize("most_points", [0, -1])
+def test_fewer_points_than_one_are_refused(make, most_points):
+    with pytest.raises(StereoweaveError, match=f"^most_points: expected at least 1, found {most_points}$"):
+        make(pair_of((4, 6)), estimate_of(np.full((4, 6), FAR_PX)), most_points=most_points)
+
+
 def test_a_ply_file_holds_points_in_metres_in_the_axes_of_viewers_with_colours(tmp_path):
     cloud = make_point_cloud(pair_of((40, 60)), estimate_of(two_planes()))
     write_ply(tmp_path / "cloud.ply", cloud)
