@@ -82,8 +82,8 @@ MISTAKES = {
     "0x6; displays use 5x9, 8x6, 7x7 or 11x6",
     f"view {PAIR} --layout wiggle --position 0.3": "--position: expected only for a single view, found with "
     "the layout wiggle, whose positions are fixed; widen them with --strength",
-    f"view {PAIR} --position 1 --strength 9": "--position: expected -1 to 2 (0 is the left camera and 1 the "
-    "right one), got 5 (position 1 at strength 9)",
+    f"view {PAIR} --position 1 --strength 9": "--strength: expected views from -1 to 2 (0 is the left "
+    "camera and 1 the right one), got 5 (position 1 at strength 9)",
     f"view {PAIR} --size big": "--size: expected the longer side in pixels, or width x height, such as 1600 "
     "or 1600x1200, at least 32 px per side, found 'big'",
     # Rigs.

@@ -284,7 +284,7 @@ def test_positions_that_can_be_rendered_are_accepted(positions, strength):
     ],
 )
 def test_positions_that_cannot_be_rendered_are_refused(positions, strength, found):
-    with pytest.raises(StereoweaveError, match=f"expected -1 to 2 .*, {found}"):
+    with pytest.raises(StereoweaveError, match=f"expected (views from )?-1 to 2 .*, {found}"):
         check_positions(positions, strength)
 
 

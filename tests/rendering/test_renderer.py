@@ -233,7 +233,9 @@ def test_strength_widens_the_baseline_about_the_middle(rng):
     pair = StereoPair(left=left, right=right)
     wide = Renderer(pair, estimate, strength=1.6).view(0.75)
     np.testing.assert_array_equal(wide.image, render(left, right, estimate, 0.5 + 1.6 * 0.25).image)
-    with pytest.raises(ValueError, match=r"^position: expected -1 to 2 .+ got 2\.1 \(.* at strength 1\.6\)$"):
+    with pytest.raises(
+        ValueError, match=r"^strength: expected views from -1 to 2 .+ got 2\.1 \(.* at strength 1\.6\)$"
+    ):
         Renderer(pair, estimate, strength=1.6).view(1.5)
 
 
