@@ -23,6 +23,7 @@ from stereoweave.rendering.layouts import (
     add_mark,
     check_positions,
     check_shows_depth,
+    describe_picture,
     has_two_views,
     median_disparity_px,
     render_views,
@@ -170,7 +171,7 @@ class ViewFile:
             options, said = self._add_windows(renderer, name)
             image = _cut(LAYOUTS[name].compose(renderer, options), part)
             write_picture(self.path, image, _find_camera(renderer))
-            return WrittenView(f"{name}, {image.shape[1]}x{image.shape[0]} px{said}", image)
+            return WrittenView(describe_picture(self.path, name, image) + said, image)
         motion = ANIMATIONS[name]
         turns = motion.turns(self.path)
         frames = render_views(renderer, motion.positions * turns)

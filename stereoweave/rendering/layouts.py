@@ -271,6 +271,7 @@ VIEWER = "viewer"
 """The layout of a page that shows the scene in 3-D (`outputs/viewer.py`)."""
 # Layouts that are determined by the file extension.
 _LAYOUT_BY_ENDING = {".mpo": "side_by_side", ".heic": "side_by_side", ".jps": "crossed", ".html": VIEWER}
+_HOLD_TWO_PICTURES = (".mpo", ".heic")
 # No chroma subsampling, because stereo pictures are magnified and compared by both eyes.
 _FINE = {"quality": 95, "subsampling": 0}
 # The JPEG marker APP3, the segment's length, the identifier, the length of the next four bytes, these four
@@ -381,6 +382,14 @@ def write_picture(
         else:
             first, second = (Image.fromarray(half) for half in np.split(picture, 2, axis=1))
             first.save(temporary, "MPO", save_all=True, append_images=[second], **_FINE)
+
+
+def describe_picture(path: str | Path, name: str, picture: UInt8[np.ndarray, "h w 3"]) -> str:
+    """Describe what `write_picture` writes: the layout and its size, or the two pictures in the file."""
+    height_px, width_px = picture.shape[:2]
+    if Path(path).suffix.lower() in _HOLD_TWO_PICTURES:
+        return f"two pictures of {width_px // 2}x{height_px} px in one file"
+    return f"{name}, {width_px}x{height_px} px"
 
 
 def squeeze(eye: Num[np.ndarray, "h w 3"], axis: int) -> Num[np.ndarray, "h2 w2 3"]:

@@ -94,8 +94,9 @@ def test_a_single_view_uses_strength_and_reports_the_share_that_neither_camera_s
     assert "narrow.png: view at 1.5, 0.0 % of it seen by neither camera" in capfd.readouterr().out
 
 
-def test_the_extension_of_a_file_can_select_the_layout(pair):
+def test_the_extension_of_a_file_can_select_the_layout(pair, capfd):
     assert run("view left.png right.png --model small -o v.mpo") == 0
+    assert "v.mpo: two pictures of 95x64 px in one file" in capfd.readouterr().out
     assert run("view left.png right.png --model small -o v.jps") == 0
     with Image.open("v.mpo") as file:
         assert (file.n_frames, file.size) == (2, (95, 64))

@@ -153,7 +153,7 @@ def test_the_command_view_writes_a_spatial_photo(tmp_path, capsys):
         write_image(tmp_path / f"{name}.png", eye)
     words = ["view", str(tmp_path / "left.png"), str(tmp_path / "right.png"), "--model", "small", "-o"]
     assert main([*words, str(tmp_path / "photo.heic")]) == 0
-    assert "photo.heic: side_by_side, 320x96 px" in capsys.readouterr().out
+    assert "photo.heic: two pictures of 160x96 px in one file" in capsys.readouterr().out
     assert np.abs(open_pictures([tmp_path / "photo.heic"]).pair.left.astype(int) - LEFT).mean() < 5
     assert main([*words, str(tmp_path / "photo.heic"), "--layout", "quilt"]) == 2
     assert "expected the layout side_by_side for this extension, found quilt" in capsys.readouterr().err
