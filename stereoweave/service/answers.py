@@ -227,9 +227,11 @@ def _write_map(path: Path, result: Result) -> None:
         FILES[path.name](path, result)
     except RangeError as error:
         summary = result.summary
+        causes = [f"{problem.format(field_name)}; or " for problem in result.warnings()]
         raise StereoweaveError(
             f"{path.name}: expected disparities from 0 to 255.99 px, the range of a PNG, found "
-            f"{summary.disparity_min_px:.2f} to {summary.disparity_max_px:.2f} px; request pfm, npy or tiff"
+            f"{summary.disparity_min_px:.2f} to {summary.disparity_max_px:.2f} px; "
+            f"{''.join(causes)}request pfm, npy or tiff"
         ) from error
 
 

@@ -1,4 +1,5 @@
 import io
+import re
 import shutil
 from collections.abc import Sequence
 from dataclasses import replace
@@ -56,6 +57,18 @@ def test_jobs_matched_together_get_the_same_answers_as_alone(estimate, tmp_path)
     assert np.load(io.BytesIO(within.content)).max() == 16
     assert "expected a picture" in str(damaged)
     assert "range_px" in str(beyond)
+
+
+def test_a_png_of_swapped_pictures_is_refused_with_the_cause(tmp_path):
+    swapped = replace(job(tmp_path / "swapped"), file="disparity.png")
+    swapped = replace(swapped, pictures=swapped.pictures[::-1])
+    (error,) = answer_many(Matcher("small"), [swapped])
+    assert re.fullmatch(
+        r"disparity\.png: expected disparities from 0 to 255\.99 px, the range of a PNG, found -\d+\.\d\d to "
+        r"-?\d+\.\d\d px; left and right are swapped; give them the other way round; or request pfm, npy "
+        "or tiff",
+        str(error),
+    )
 
 
 def test_no_files_remain_if_the_client_disconnects_during_matching(tmp_path):
