@@ -48,8 +48,8 @@ ERRORS: dict[str, tuple[str, dict[str, str], dict[str, Any]]] = {
     "rectified pair (calib, focal_px, baseline_m)": ("/depth", PAIR, {}),
     "range: expected disparities between -640 and 640 px, the width of the pictures, got 700 and 800; omit "
     "it for automatic detection": ("/disparity", PAIR, {"range": "700,800"}),
-    "position: expected -1 to 2 (0 is the left camera and 1 the right one), got 3.5 (position 2 at "
-    "strength 2)": (
+    "strength: expected views from -1 to 2 (0 is the left camera and 1 the right one), got 3.5 "
+    "(position 2 at strength 2)": (
         "/view",
         PAIR,
         {"position": 2, "strength": 2},

@@ -170,7 +170,7 @@ def test_a_cut_file_is_converted_as_far_as_it_goes(tmp_path, capsys):
             "--layout side_by_side --screen cinema",
             "--screen: expected one of phone, television",
         ),
-        ("--layout quilt --screen phone --strength 9", "position: expected -1 to 2"),
+        ("--layout quilt --screen phone --strength 9", "strength: expected views from -1 to 2"),
         ("--layout side_by_side --screen phone --convergence nan", "--convergence: expected a finite number"),
     ],
 )
