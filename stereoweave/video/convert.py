@@ -29,11 +29,11 @@ from stereoweave.video.job import VideoJob
 from stereoweave.video.layout_marks import PACKED, find_baseline_m, mark_layout
 from stereoweave.video.mp4_marks import VideoMarks
 from stereoweave.video.parts import open_parts
+from stereoweave.video.picture_track import list_picture_files
 from stereoweave.video.reader import StereoVideo
 from stereoweave.video.sphere_output import WholeOutput
 from stereoweave.video.survey import survey_video
 from stereoweave.video.times import PART_S, format_time
-from stereoweave.video.tracks import list_picture_files
 from stereoweave.video.writer import (
     BT709,
     DEPTH10,

@@ -9,7 +9,9 @@ from jaxtyping import Float32, UInt8
 
 from stereoweave.errors import FormatError, Note
 from stereoweave.stereo import StereoCamera
-from stereoweave.video.tracks import PictureTrack, Shot, Track
+from stereoweave.video.picture_track import PictureTrack
+from stereoweave.video.track_frame import Shot
+from stereoweave.video.tracks import Track
 
 
 class FrameSequence:

@@ -5,7 +5,7 @@ from itertools import islice
 from pathlib import Path
 
 from stereoweave.errors import FormatError
-from stereoweave.video.tracks import open_container
+from stereoweave.video.streams import open_container
 
 # A disc repeats its parameter sets at least once a second, in every access unit that can be decoded alone.
 _MOST_PACKETS, _MOST_UNITS = 400, 1000

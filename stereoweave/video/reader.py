@@ -21,8 +21,10 @@ from stereoweave.pictures.panoramas import SphereView, choose_layout, guess_proj
 from stereoweave.video.frame_sequence import FrameSequence
 from stereoweave.video.mvc import check_not_mvc
 from stereoweave.video.packings import FRAME_PACKINGS, FRAME_SEQUENTIAL, TWO_STREAMS
+from stereoweave.video.picture_track import list_picture_files
 from stereoweave.video.times import format_frame_time
-from stereoweave.video.tracks import Shot, Track, VideoTrack, list_picture_files, open_track
+from stereoweave.video.track_frame import Shot
+from stereoweave.video.tracks import Track, VideoTrack, open_track
 from stereoweave.video.twin_streams import open_twins
 
 # A spatial or frame-sequential video is refused if none of this many images is followed by its second

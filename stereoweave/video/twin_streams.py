@@ -12,7 +12,8 @@ from typing import NamedTuple
 from stereoweave.errors import FormatError, Note, Remedy
 from stereoweave.pictures.pair_layouts import show_same_scene
 from stereoweave.video.packings import TWO_STREAMS
-from stereoweave.video.tracks import StreamFacts, VideoTrack, list_video_streams
+from stereoweave.video.streams import StreamFacts, list_video_streams
+from stereoweave.video.tracks import VideoTrack
 
 _OVERRIDE = Remedy("override it if it is wrong", ("format",))
 _SIDES = ("left_", "right_")

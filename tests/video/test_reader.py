@@ -26,7 +26,8 @@ from stereoweave.io.images import write_image
 from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS, detect_layout, measure_resemblance
 from stereoweave.video import tracks
 from stereoweave.video.reader import open_video
-from stereoweave.video.tracks import _fill_missing, _number_by_rank, _separate_duplicates, open_track
+from stereoweave.video.timestamps import fill_missing, number_by_rank, separate_duplicates
+from stereoweave.video.tracks import open_track
 
 BEFORE = "damaged: replaced by the frame before it"
 SPOILT = "decoded from a damaged frame before it"
@@ -290,20 +291,20 @@ def test_a_repeated_time_stamp_delays_only_its_own_frame(tmp_path):
 
 
 def test_a_duplicate_is_delayed_by_one_frame_if_there_is_room():
-    assert _separate_duplicates([0, 40, 40, 200, 200], frame_steps=40) == (
+    assert separate_duplicates([0, 40, 40, 200, 200], frame_steps=40) == (
         array("q", [0, 40, 80, 200, 240]),
         [2, 4],
     )
 
 
 def test_times_increase_even_without_room_between_duplicates():
-    steps, moved = _separate_duplicates([0, 5, 5, 5, 6, 9], frame_steps=4)
+    steps, moved = separate_duplicates([0, 5, 5, 5, 6, 9], frame_steps=4)
     assert list(steps) == [0, 5, 6, 7, 8, 9]
     assert moved == [2, 3]
 
 
 def test_a_missing_time_stamp_is_replaced_by_the_previous_one():
-    assert _fill_missing([None, 40, None, 120]) == [40, 40, 40, 120]
+    assert fill_missing([None, 40, None, 120]) == [40, 40, 40, 120]
 
 
 @pytest.mark.parametrize(("key_every", "spoilt"), [("1", []), ("5", [4])])
@@ -326,7 +327,7 @@ def test_with_b_frames_a_lost_frame_is_noticed_at_the_next_key_frame():
     # The file contains I0 P1 B2 B3 P4 I5 P6, and B3 is lost.
     shown = [SimpleNamespace(opaque=rank, key_frame=rank in (0, 5)) for rank in (0, 2, 1, 4, 5, 6)]
     decoder = SimpleNamespace(codec_context=SimpleNamespace(has_b_frames=True))
-    assert [number for number, _ in _number_by_rank(iter(shown), decoder)] == [0, 1, 2, 3, 5, 6]
+    assert [number for number, _ in number_by_rank(iter(shown), decoder)] == [0, 1, 2, 3, 5, 6]
 
 
 def test_a_folder_of_pictures_is_a_video_in_numerical_order(tmp_path):
@@ -510,7 +511,7 @@ def test_an_excerpt_after_a_key_frame_without_a_time_stamp_has_the_frames_of_the
     tmp_path, monkeypatch
 ):
     path = write_side_by_side(tmp_path / "video.mkv", example_pairs(12), codec="mpeg4", options={"g": "4"})
-    decode, stamps_of = tracks._decode, tracks._stamps
+    decode, stamps_of = tracks.decode, tracks.read_stamps
     missing = 8 * FRAME_MS
 
     def decode_without_stamp(*file):
@@ -522,8 +523,8 @@ def test_an_excerpt_after_a_key_frame_without_a_time_stamp_has_the_frames_of_the
         stamps, *rest = stamps_of(*file)
         return [None if stamp == missing else stamp for stamp in stamps], *rest
 
-    monkeypatch.setattr(tracks, "_decode", decode_without_stamp)
-    monkeypatch.setattr(tracks, "_stamps", stamps_without_one)
+    monkeypatch.setattr(tracks, "decode", decode_without_stamp)
+    monkeypatch.setattr(tracks, "read_stamps", stamps_without_one)
     video = open_video([path], "side_by_side")
     whole = list(video.frames())
     part = list(video.excerpt(0.36, 0.12).frames())  # frames 9 to 11 of 25 a second

@@ -200,14 +200,14 @@ def test_a_long_spatial_video_without_its_second_view_is_refused_without_decodin
     )
     path = tmp_path / "long.hevc"
     path.write_bytes(8 * stream)
-    decode, decoded = tracks._decode, []
+    decode, decoded = tracks.decode, []
 
     def count_decoded(*file):
         for frame in decode(*file):
             decoded.append(frame.pts)
             yield frame
 
-    monkeypatch.setattr(tracks, "_decode", count_decoded)
+    monkeypatch.setattr(tracks, "decode", count_decoded)
     assert "found no frame with a second view" in refusal(path)
     assert len(decoded) < 8 * SPATIAL_FRAMES
 

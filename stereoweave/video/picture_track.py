@@ -1,0 +1,101 @@
+"""A series of pictures as a track of frames."""
+
+import re
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import suppress
+from fractions import Fraction
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+
+from stereoweave.errors import FormatError, Note
+from stereoweave.io.decoding import ENDINGS
+from stereoweave.io.images import read_image
+from stereoweave.stereo import StereoCamera
+from stereoweave.video.sphere_marks import SphereMark
+from stereoweave.video.track_frame import SAMPLED_AT, Shot
+
+
+class PictureTrack:
+    """Frames of a series of pictures, with the attributes of a `VideoTrack`.
+
+    Raises:
+        FormatError: No picture in `files` can be read.
+    """
+
+    declared_packing: str | None = None
+    is_spatial = False
+    camera: StereoCamera | None = None
+    sphere: SphereMark | None = None
+    notes: Sequence[Note] = ()
+    hdr_colours: tuple[int, int, int] | None = None
+    retimed: Collection[int] = ()
+    sound: Path | None = None
+    truncation: str | None = None
+
+    def __init__(self, name: str, files: Sequence[Path], rate: Fraction) -> None:
+        self.name = name
+        self._files = files
+        self.steps: Sequence[int] = range(len(files))
+        self.rate, self.time_base = rate, 1 / rate
+        first = self._read_first()
+        self.size_px = first.shape[1], first.shape[0]
+
+    def shots(self, start: int, first: int = 0) -> Iterator[Shot]:
+        """Yield the readable pictures, beginning with the last readable one at or before `start`.
+
+        `first` is ignored, because every picture is a key frame.
+        """
+        before = next((index for index in range(start, 0, -1) if self._read_shot(index)), 0)
+        yield from filter(None, map(self._read_shot, self.steps[before:]))
+
+    def samples(self) -> list[UInt8[np.ndarray, "h w 3"]]:
+        """Return one or more images from different parts of the series."""
+        starts = [int(share * len(self._files)) for share in (0.0, *SAMPLED_AT)]
+        shots = [shot for start in starts for shot in islice(self.shots(start), 1)]
+        return [picture for shot in shots for picture in shot.pictures()]
+
+    def _read_first(self) -> UInt8[np.ndarray, "h w 3"]:
+        """Return the first picture that can be read."""
+        problem: FormatError | None = None
+        for file in self._files:
+            try:
+                return read_image(file)
+            except FormatError as error:
+                problem = problem or error
+        raise FormatError(f"{self.name}: expected pictures, found only unreadable files: {problem}")
+
+    def _read_shot(self, index: int) -> Shot | None:
+        picture = self._read_picture(index)
+        if picture is None:
+            return None
+        return Shot(index, lambda: [picture], True, lambda: [picture.astype(np.float32)])
+
+    def _read_picture(self, index: int) -> UInt8[np.ndarray, "h w 3"] | None:
+        with suppress(FormatError):
+            picture = read_image(self._files[index])
+            if self.size_px == (picture.shape[1], picture.shape[0]):
+                return picture
+        return None
+
+
+def list_picture_files(path: Path) -> list[Path] | None:
+    """Return the pictures in a folder or matching a glob pattern, in natural order; None for other paths."""
+    if path.is_dir():
+        found = path.iterdir()
+    elif not path.exists() and re.search(r"[*?\[]", path.name):
+        found = path.parent.glob(path.name)
+    else:
+        return None
+    return sorted(filter(_is_picture, found), key=_natural_key)
+
+
+def _is_picture(file: Path) -> bool:
+    return file.suffix.lower() in ENDINGS and not file.name.startswith(".")
+
+
+def _natural_key(file: Path) -> list[tuple[int, str]]:
+    parts = re.split(r"(\d+)", file.name)
+    return [(int(part), part) if part.isdecimal() else (0, part) for part in parts]
