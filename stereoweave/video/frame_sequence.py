@@ -10,7 +10,7 @@ from jaxtyping import Float32, UInt8
 from stereoweave.errors import FormatError, Note
 from stereoweave.stereo import StereoCamera
 from stereoweave.video.picture_track import PictureTrack
-from stereoweave.video.track_frame import Shot
+from stereoweave.video.track_frame import TrackFrame
 from stereoweave.video.tracks import Track
 
 
@@ -40,36 +40,36 @@ class FrameSequence:
         odd = [Note("the last frame is dropped, because no second view follows it")]
         self.notes = [*track.notes, *(odd if len(track.steps) % 2 else [])]
 
-    def shots(self, start: int, first: int = 0) -> Iterator[Shot]:
+    def frames(self, start: int, first: int = 0) -> Iterator[TrackFrame]:
         """Yield the pairs of which both frames can be decoded, the first one early enough to bridge gaps.
 
-        It is at or before `start` or `first`, if there is one; see the tracks' `shots`.
+        It is at or before `start` or `first`, if there is one; see the tracks' `frames`.
         """
         if isinstance(self._track, PictureTrack):
             yield from self._pair(2 * _find_whole_pair(self._track, start))
             return
-        shots = self._pair(2 * start, 2 * first)
-        opening = next(shots, None)
+        frames = self._pair(2 * start, 2 * first)
+        opening = next(frames, None)
         if opening is None or opening.number > first > 0:
-            shots, opening = self._pair(0), None
+            frames, opening = self._pair(0), None
         if opening is not None:
             yield opening
-        yield from shots
+        yield from frames
 
     def can_begin(self, most: int) -> bool:
         """Return whether the first frames that can be decoded, at most this many, hold a pair."""
-        shots = islice(self._track.shots(0), most)
-        return next(_pair_shots(shots, right_first=self._right_first), None) is not None
+        frames = islice(self._track.frames(0), most)
+        return next(_pair_frames(frames, right_first=self._right_first), None) is not None
 
-    def _pair(self, start: int, first: int = 0) -> Iterator[Shot]:
-        return _pair_shots(self._track.shots(start, first), right_first=self._right_first)
+    def _pair(self, start: int, first: int = 0) -> Iterator[TrackFrame]:
+        return _pair_frames(self._track.frames(start, first), right_first=self._right_first)
 
 
 def _find_whole_pair(track: PictureTrack, start: int) -> int:
     """Return the number of the last pair at or before `start` of readable pictures; 0 if there is none."""
     pair = start
     while pair > 0:
-        numbers = [shot.number for shot in islice(track.shots(2 * pair), 2)]
+        numbers = [frame.number for frame in islice(track.frames(2 * pair), 2)]
         if numbers == [2 * pair, 2 * pair + 1]:
             break
         # The first picture is the last readable one at or before the pair's, if there is one.
@@ -77,23 +77,23 @@ def _find_whole_pair(track: PictureTrack, start: int) -> int:
     return pair
 
 
-def _pair_shots(shots: Iterable[Shot], *, right_first: bool) -> Iterator[Shot]:
+def _pair_frames(frames: Iterable[TrackFrame], *, right_first: bool) -> Iterator[TrackFrame]:
     waiting = None
-    for shot in shots:
-        if waiting is not None and shot.number % 2 and shot.number == waiting.number + 1:
-            both = (shot, waiting) if right_first else (waiting, shot)
-            yield Shot(
-                number=shot.number // 2,
+    for frame in frames:
+        if waiting is not None and frame.number % 2 and frame.number == waiting.number + 1:
+            both = (frame, waiting) if right_first else (waiting, frame)
+            yield TrackFrame(
+                number=frame.number // 2,
                 pictures=partial(_convert_both, *both),
                 is_key_frame=waiting.is_key_frame,
                 fine_pictures=partial(_convert_both_fine, *both),
             )
-        waiting = shot
+        waiting = frame
 
 
-def _convert_both(left: Shot, right: Shot) -> list[UInt8[np.ndarray, "h w 3"]]:
+def _convert_both(left: TrackFrame, right: TrackFrame) -> list[UInt8[np.ndarray, "h w 3"]]:
     return [*left.pictures(), *right.pictures()]
 
 
-def _convert_both_fine(left: Shot, right: Shot) -> list[Float32[np.ndarray, "h w 3"]]:
+def _convert_both_fine(left: TrackFrame, right: TrackFrame) -> list[Float32[np.ndarray, "h w 3"]]:
     return [*left.fine_pictures(), *right.fine_pictures()]

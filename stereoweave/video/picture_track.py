@@ -15,7 +15,7 @@ from stereoweave.io.decoding import ENDINGS
 from stereoweave.io.images import read_image
 from stereoweave.stereo import StereoCamera
 from stereoweave.video.sphere_marks import SphereMark
-from stereoweave.video.track_frame import SAMPLED_AT, Shot
+from stereoweave.video.track_frame import SAMPLED_AT, TrackFrame
 
 
 class PictureTrack:
@@ -43,19 +43,19 @@ class PictureTrack:
         first = self._read_first()
         self.size_px = first.shape[1], first.shape[0]
 
-    def shots(self, start: int, first: int = 0) -> Iterator[Shot]:
+    def frames(self, start: int, first: int = 0) -> Iterator[TrackFrame]:
         """Yield the readable pictures, beginning with the last readable one at or before `start`.
 
         `first` is ignored, because every picture is a key frame.
         """
-        before = next((index for index in range(start, 0, -1) if self._read_shot(index)), 0)
-        yield from filter(None, map(self._read_shot, self.steps[before:]))
+        before = next((index for index in range(start, 0, -1) if self._read_frame(index)), 0)
+        yield from filter(None, map(self._read_frame, self.steps[before:]))
 
     def samples(self) -> list[UInt8[np.ndarray, "h w 3"]]:
         """Return one or more images from different parts of the series."""
         starts = [int(share * len(self._files)) for share in (0.0, *SAMPLED_AT)]
-        shots = [shot for start in starts for shot in islice(self.shots(start), 1)]
-        return [picture for shot in shots for picture in shot.pictures()]
+        frames = [frame for start in starts for frame in islice(self.frames(start), 1)]
+        return [picture for frame in frames for picture in frame.pictures()]
 
     def _read_first(self) -> UInt8[np.ndarray, "h w 3"]:
         """Return the first picture that can be read."""
@@ -67,11 +67,11 @@ class PictureTrack:
                 problem = problem or error
         raise FormatError(f"{self.name}: expected pictures, found only unreadable files: {problem}")
 
-    def _read_shot(self, index: int) -> Shot | None:
+    def _read_frame(self, index: int) -> TrackFrame | None:
         picture = self._read_picture(index)
         if picture is None:
             return None
-        return Shot(index, lambda: [picture], True, lambda: [picture.astype(np.float32)])
+        return TrackFrame(index, lambda: [picture], True, lambda: [picture.astype(np.float32)])
 
     def _read_picture(self, index: int) -> UInt8[np.ndarray, "h w 3"] | None:
         with suppress(FormatError):

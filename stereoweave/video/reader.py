@@ -23,7 +23,7 @@ from stereoweave.video.mvc import check_not_mvc
 from stereoweave.video.packings import FRAME_PACKINGS, FRAME_SEQUENTIAL, TWO_STREAMS
 from stereoweave.video.picture_track import list_picture_files
 from stereoweave.video.times import format_frame_time
-from stereoweave.video.track_frame import Shot
+from stereoweave.video.track_frame import TrackFrame
 from stereoweave.video.tracks import Track, VideoTrack, open_track
 from stereoweave.video.twin_streams import open_twins
 
@@ -170,18 +170,18 @@ class StereoVideo:
             *(_bridge_gaps(track, first + start, first) for track in self._tracks), strict=False
         )
         for index, seen in zip(range(first + start, first + self.frame_count), every_track, strict=False):
-            pictures = [picture for shot, _ in seen for picture in shot.pictures()]
+            pictures = [picture for frame, _ in seen for picture in frame.pictures()]
             left, right = self._split.eyes(*pictures) if self._split else pictures
             if self._cutter:
                 left, right = self._cutter.cut(left), self._cutter.cut(right)
             time = (steps[index] - steps[first]) * self.time_base
             self.on_frame(index - first)
             problem = self._describe_problem(index, [problem for _, problem in seen])
-            fine = partial(self._split_fine, [shot for shot, _ in seen]) if self._reads_fine else None
+            fine = partial(self._split_fine, [frame for frame, _ in seen]) if self._reads_fine else None
             yield StereoFrame(left, right, time, problem, fine)
 
-    def _split_fine(self, shots: Sequence[Shot]) -> FinePair:
-        pictures = [picture for shot in shots for picture in shot.fine_pictures()]
+    def _split_fine(self, frames: Sequence[TrackFrame]) -> FinePair:
+        pictures = [picture for frame in frames for picture in frame.fine_pictures()]
         left, right = self._split.eyes(*pictures) if self._split else pictures
         return (self._cutter.cut(left), self._cutter.cut(right)) if self._cutter else (left, right)
 
@@ -344,25 +344,25 @@ def _check_alike(left: Track, right: Track) -> None:
         )
 
 
-def _bridge_gaps(track: _Source, start: int, first: int) -> Iterator[tuple[Shot, str | None]]:
-    """Yield a shot and its problem, if any, for each frame from number `start` on; replace missing frames.
+def _bridge_gaps(track: _Source, start: int, first: int) -> Iterator[tuple[TrackFrame, str | None]]:
+    """Yield each frame from number `start` on, and its problem if it has one; replace missing frames.
 
     Decoding begins at a key frame at or before frame `first`.
     """
     upcoming, last, after_damage = 0, None, False
-    for shot in track.shots(start, first):
-        index = shot.number
+    for frame in track.frames(start, first):
+        index = frame.number
         if not upcoming <= index < len(track.steps):
             continue
         missing = range(upcoming, index)
         yield from (
-            (last or shot, _REPEATED_LAST if last else _REPEATED_NEXT)
+            (last or frame, _REPEATED_LAST if last else _REPEATED_NEXT)
             for number in missing
             if number >= start
         )
-        after_damage = not shot.is_key_frame and (after_damage or bool(missing))
+        after_damage = not frame.is_key_frame and (after_damage or bool(missing))
         if index >= start:
-            yield shot, _AFTER_DAMAGE if after_damage else None
-        upcoming, last = index + 1, shot
+            yield frame, _AFTER_DAMAGE if after_damage else None
+        upcoming, last = index + 1, frame
     if last:
         yield from ((last, _REPEATED_LAST) for number in range(upcoming, len(track.steps)) if number >= start)

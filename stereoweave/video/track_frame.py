@@ -10,7 +10,7 @@ from jaxtyping import Float32, UInt8
 SAMPLED_AT = 0.1, 0.3, 0.5, 0.7, 0.9
 
 
-class Shot(NamedTuple):
+class TrackFrame(NamedTuple):
     """Decoded frame.
 
     Attributes:

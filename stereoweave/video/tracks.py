@@ -28,7 +28,7 @@ from stereoweave.video.timestamps import (
     read_stamps,
     separate_duplicates,
 )
-from stereoweave.video.track_frame import SAMPLED_AT, Shot
+from stereoweave.video.track_frame import SAMPLED_AT, TrackFrame
 
 if TYPE_CHECKING:
     import av
@@ -110,7 +110,7 @@ class VideoTrack:
         """Return the camera that a video with both views in each frame declares for views of this size."""
         return self._packed.camera(size_px)
 
-    def shots(self, start: int, first: int = 0) -> Iterator[Shot]:
+    def frames(self, start: int, first: int = 0) -> Iterator[TrackFrame]:
         """Yield the frames that can be decoded, in display order, from a key frame at or before `first` on.
 
         `start` is ignored. The artefacts that follow a damaged frame depend on all frames before it, so only
@@ -118,24 +118,24 @@ class VideoTrack:
         """
         with self._opening() as (container, stream):
             if first and self._stamps is not None:
-                shots = self._read_after_seek(container, stream, first)
-                opening = next(shots, None)
+                frames = self._read_after_seek(container, stream, first)
+                opening = next(frames, None)
                 if opening and opening.number <= first:
                     yield opening
-                    yield from shots
+                    yield from frames
                     return
         with self._opening() as (container, stream):
-            yield from self._read_shots(container, stream)
+            yield from self._read_frames(container, stream)
 
     def can_begin(self, most: int) -> bool:
         """Return whether the first decoded images, at most this many, hold a frame with all its views."""
         with self._opening() as (container, stream):
-            return next(self._read_shots(container, stream, most), None) is not None
+            return next(self._read_frames(container, stream, most), None) is not None
 
     def _read_after_seek(
         self, container: "av.container.InputContainer", stream: "av.VideoStream", first: int
-    ) -> Iterator[Shot]:
-        """Seek to the last key frame at or before a frame, and return the shots from a key frame on.
+    ) -> Iterator[TrackFrame]:
+        """Seek to the last key frame at or before a frame, and return the frames from a key frame on.
 
         Containers without an index may seek to a later one. There are none if timestamps are missing: a frame
         without one is numbered by the frames before it.
@@ -150,11 +150,11 @@ class VideoTrack:
         except av.error.FFmpegError:
             return iter(())
         # Frames before the key frame in display order refer to frames that are not decoded.
-        return dropwhile(lambda shot: not shot.is_key_frame, self._read_shots(container, stream))
+        return dropwhile(lambda frame: not frame.is_key_frame, self._read_frames(container, stream))
 
-    def _read_shots(
+    def _read_frames(
         self, container: "av.container.InputContainer", stream: "av.VideoStream", most: int | None = None
-    ) -> Iterator[Shot]:
+    ) -> Iterator[TrackFrame]:
         decoded: Iterator[Any] = islice(decode(container, stream), most)
         moments = pair_views(decoded) if self.is_spatial else decoded
         placed = (
@@ -167,7 +167,7 @@ class VideoTrack:
             if all(
                 not view.is_corrupt and (view.width, view.height) == self._frame_size_px for view in views
             ):
-                yield Shot(
+                yield TrackFrame(
                     index,
                     partial(_convert_all, views),
                     moment.key_frame,

@@ -504,7 +504,7 @@ def test_an_excerpt_has_the_frames_of_the_whole_video(tmp_path, name, codec, opt
 def test_decoding_for_an_excerpt_begins_at_the_key_frame_before_it(tmp_path):
     path = write_side_by_side(tmp_path / "video.mkv", example_pairs(30), codec="libx264", options={"g": "8"})
     track = open_track(path, None)
-    assert [next(track.shots(0, first)).number for first in (0, 7, 8, 20, 29)] == [0, 0, 8, 16, 24]
+    assert [next(track.frames(0, first)).number for first in (0, 7, 8, 20, 29)] == [0, 0, 8, 16, 24]
 
 
 def test_an_excerpt_after_a_key_frame_without_a_time_stamp_has_the_frames_of_the_whole_video(

@@ -167,7 +167,7 @@ def test_an_excerpt_has_the_frames_of_the_whole_spatial_video():
 
 def test_decoding_for_an_excerpt_begins_at_the_key_frame_before_it():
     track = open_track(SPATIAL, None)
-    assert [next(track.shots(0, first)).number for first in (0, 9, 10, 19, 49)] == [0, 0, 10, 10, 40]
+    assert [next(track.frames(0, first)).number for first in (0, 9, 10, 19, 49)] == [0, 0, 10, 10, 40]
 
 
 @pytest.mark.parametrize("layer", [0, 1])
