@@ -29,13 +29,13 @@ _ENDINGS = {
     "raw": tuple(raw.ENDINGS - {".raw"}),
     "film": (".mp4", ".mkv", ".mk3d", ".mov", ".avi", ".webm"),
 }
-_SIDES = {"left": "right", "Left": "Right", "LEFT": "RIGHT", "l": "r", "L": "R", "im0": "im1"}
+_SIDES = {"left": "right", "Left": "Right", "LEFT": "RIGHT", "l": "r", "L": "R", "im0": "im1", "cam0": "cam1"}
 _OTHER_SIDES = _SIDES | {right: left for left, right in _SIDES.items()}
 # Matches left, leftImg8bit and imgLeft, but not leftover; matches a single letter only at the start or the
 # end of a name.
 _MARK = re.compile(
     r"(?<![A-Za-z])(?:left|right|LEFT|RIGHT)(?![a-z])|(?:Left|Right)(?![a-z])"
-    r"|^[lLrR](?=$|[ _.-])|(?<![A-Za-z])[lLrR]$|^im[01]$"
+    r"|^[lLrR](?=$|[ _.-])|(?<![A-Za-z])[lLrR]$|^im[01]$|(?<![A-Za-z])cam[01](?![A-Za-z0-9])"
 )
 _NOT_IN_NAMES = re.compile(r'[<>:"/\\|?*\x00-\x1f]')
 # Names of Windows devices, and of a batch's own files and folders.
@@ -159,11 +159,11 @@ def find_pairs_among(folder: str | Path, paths: Iterable[str]) -> Listed:
     """Find the pairs and videos among the files of a folder.
 
     Two pictures are a pair if their paths differ only in their left/right marks: left/a.png and
-    right/a.png, a_L.png and a_R.png, left_01.png and right_01.png, im0.png and im1.png. If one picture is
-    missing, the pair is still listed, and fails when it is read. A file with both views is also a pair. A
-    camera raw file counts only if no picture beside it has its name.
-    If there is no such pair or file, every picture is taken to hold both views. A calib.txt beside left.png
-    or im0.png belongs to that pair. Output folders of batches are ignored.
+    right/a.png, a_L.png and a_R.png, left_01.png and right_01.png, im0.png and im1.png, cam0/a.png and
+    cam1/a.png. If one picture is missing, the pair is still listed, and fails when it is read. A file with
+    both views is also a pair. A camera raw file counts only if no picture beside it has its name. If there is
+    no such pair or file, every picture is taken to hold both views. A calib.txt beside left.png or im0.png
+    belongs to that pair. Output folders of batches are ignored.
 
     Args:
         folder: Path or URL of the folder; a pair whose name consists only of marks is named after the folder.

@@ -37,6 +37,8 @@ def listed(folder: Path, pairs: list[NamedPair]) -> dict[str, tuple[str, ...]]:
         ("DSC_0001", "DSC_0001L.jpg", "DSC_0001R.jpg"),
         ("castle", "castle/left.png", "castle/right.png"),
         ("castle", "castle/im0.png", "castle/im1.png"),
+        ("mav0_data_14", "mav0/cam0/data/14.png", "mav0/cam1/data/14.png"),
+        ("rig_07", "rig_cam0_07.png", "rig_cam1_07.png"),
         ("castle_0001", "castle/Left/0001.png", "castle/Right/0001.png"),
         ("Img8bit_a_1_Img8bit", "leftImg8bit/a_1_leftImg8bit.png", "rightImg8bit/a_1_rightImg8bit.png"),
         ("img_7", "imgLeft/img_7.tif", "imgRight/img_7.tif"),
@@ -56,8 +58,11 @@ def test_a_pair_right_in_the_folder_has_the_folders_name(tmp_path):
 
 
 def test_words_that_only_begin_like_a_mark_are_none(tmp_path):
-    folder = put(tmp_path, "leftover.png", "lake.png", "Room.png", "im0001.png", "ball.png")
+    folder = put(
+        tmp_path, "leftover.png", "lake.png", "Room.png", "im0001.png", "ball.png", "cam01.png", "webcam0.png"
+    )
     expected = {Path(name).stem: (name,) for name in ("leftover.png", "lake.png", "Room.png", "im0001.png")}
+    expected |= {"cam01": ("cam01.png",), "webcam0": ("webcam0.png",)}
     assert listed(folder, find_pairs_in(folder).pairs) == expected | {"ball": ("ball.png",)}
 
 
