@@ -98,7 +98,7 @@ release: $(CORE)/installed $(DEV)/installed $(AUDIT)/installed
 gallery: $(DEV)/installed
 	$(RENDER) --size 640x480 -o runs/gallery/pair
 	$(RENDER) --size 400x300 -o runs/gallery/smaller
-	$(DEV)/bin/stereoweave depth $(call RENDERED,pair) --model base -o runs/gallery/depth
+	$(DEV)/bin/stereoweave depth $(call RENDERED,pair) -o runs/gallery/depth
 	mkdir -p docs/gallery
 	cp runs/gallery/depth/preview.png docs/gallery/depth.png
 	$(VIEW) $(call RENDERED,pair) --layout side_by_side -o docs/gallery/pair.jpg
