@@ -37,7 +37,10 @@ from stereoweave.system.threads import usable_cores
 _BLAS_THREADS = "OPENBLAS_NUM_THREADS"
 DONE_FILE = "done.json"
 _NUMBERS = ("disparity_min_px", "disparity_median_px", "disparity_max_px", "confident_percent")
-_COLUMNS = ("name", "pictures", "seconds", *_NUMBERS, "notes", "error")
+_COLUMNS = ("name", "pictures", "seconds", *_NUMBERS, "warnings", "notes", "error")
+
+# Number of pairs with warnings that are named; the table has all.
+_MOST_NAMED = 5
 
 Work = Callable[[NamedPair], str | None]
 # A pair and its error, which is None on success.
@@ -52,11 +55,13 @@ class LocalTally:
         done: Number of pairs processed.
         skipped: Number of pairs finished by earlier runs.
         failed: Name and error of each failed pair.
+        warned: Names of the pairs in the folder whose results have warnings.
     """
 
     done: int
     skipped: int
     failed: tuple[tuple[str, str], ...]
+    warned: tuple[str, ...] = ()
 
 
 def run_batch(
@@ -100,8 +105,9 @@ def run_batch(
             )
         finally:
             _remove_abandoned_files(out)
-        _write_summary(out, pairs, dict(failed))
-    return LocalTally(len(missing) - len(failed), len(pairs) - len(missing), tuple(failed))
+        rows = _write_summary(out, pairs, dict(failed))
+    warned = tuple(row["name"] for row in rows if row.get("warnings"))
+    return LocalTally(len(missing) - len(failed), len(pairs) - len(missing), tuple(failed), warned)
 
 
 def run_batch_command(
@@ -136,6 +142,9 @@ def _print_counts(tally: LocalTally, out: Path) -> None:
     typer.echo(f"{out}: {count} {'pair' if count == 1 else 'pairs'}: {tally.done} made{there}{failed}")
     for name, error in tally.failed:
         typer.echo(f"failed: {name}: {error}")
+    if tally.warned:
+        shown = ", ".join(tally.warned[:_MOST_NAMED]) + (", ..." if len(tally.warned) > _MOST_NAMED else "")
+        typer.echo(f"with warnings: {len(tally.warned)} ({shown}); see the column warnings of the table")
     typer.echo(f"table: {out / SUMMARY_FILE}")
 
 
@@ -241,13 +250,14 @@ def _process_pair(out: Path, job: DepthJob, pair: NamedPair) -> str | None:
         if pair.calibration and not job.request.calibration:
             job = replace(job, request=replace(job.request, calibration=pair.calibration))
         start_s = time.perf_counter()
-        summary, notes = make_depth(pair.pictures, folder, job, owns_out=True)
+        made = make_depth(pair.pictures, folder, job, owns_out=True)
         seconds = round(time.perf_counter() - start_s, 3)
         files = sorted(path.name for path in folder.iterdir() if path.name[0] != ".")
-        lines = [note.format(job.name_of) for note in notes]
-        facts = {"sources": sources, "files": files, "seconds": seconds, "notes": lines}
+        facts = {"sources": sources, "files": files, "seconds": seconds, "summary": asdict(made.summary)}
+        for kind, notes in (("notes", made.notes), ("warnings", made.warnings)):
+            facts[kind] = [note.format(job.name_of) for note in notes]
         with replacing(folder / DONE_FILE) as temporary:
-            temporary.write_text(json.dumps(facts | {"summary": asdict(summary)}), encoding="utf-8")
+            temporary.write_text(json.dumps(facts), encoding="utf-8")
     except StereoweaveError as error:
         return " ".join(error.format(job.name_of).split())
     except Exception as error:  # a library may raise any error on a bad picture; other pairs continue
@@ -310,14 +320,17 @@ def _remove_abandoned_files(out: Path) -> None:
     remove_leftovers(out)
 
 
-def _write_summary(out: Path, pairs: Sequence[NamedPair], failed: dict[str, str]) -> None:
+def _write_summary(out: Path, pairs: Sequence[NamedPair], failed: dict[str, str]) -> list[dict[str, Any]]:
+    """Write a row for each pair in the folder, sorted by name. Returns the rows."""
     pictures = {pair.name: pair.pictures for pair in pairs}
     rows = {folder.parent.name: _read_row(folder.parent) for folder in out.glob(f"*/{DONE_FILE}")}
     rows |= {
         name: {"name": name, "pictures": " + ".join(path.name for path in pictures[name]), "error": error}
         for name, error in failed.items()
     }
-    write_table(out / SUMMARY_FILE, _COLUMNS, (rows[name] for name in sorted(rows) if rows[name]))
+    written = [rows[name] for name in sorted(rows) if rows[name]]
+    write_table(out / SUMMARY_FILE, _COLUMNS, written)
+    return written
 
 
 def _read_row(folder: Path) -> dict[str, Any]:
@@ -326,4 +339,6 @@ def _read_row(folder: Path) -> dict[str, Any]:
         return {}
     row = {name: facts["summary"][name] for name in _NUMBERS}
     row |= {"name": folder.name, "pictures": " + ".join(facts["summary"]["pictures"])}
-    return row | {"seconds": facts["seconds"], "notes": "; ".join(facts["notes"])}
+    # Earlier versions wrote the warnings among the notes.
+    lines = {kind: "; ".join(facts.get(kind, ())) for kind in ("notes", "warnings")}
+    return row | {"seconds": facts["seconds"], **lines}

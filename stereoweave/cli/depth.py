@@ -150,8 +150,8 @@ def depth(  # noqa: PLR0913 - each is an option of the command line
         from stereoweave.batch.local import run_batch_command
 
         raise typer.Exit(run_batch_command(found, out, job, processes=jobs, as_json=as_json))
-    summary, notes = make_depth(pictures, out, job)
-    lines = [note.format(job.name_of) for note in notes]
+    summary, notes, warnings = make_depth(pictures, out, job)
+    lines = [note.format(job.name_of) for note in (*notes, *warnings)]
     (_print_json if as_json else _print_summary)(summary, lines, out)
 
 

@@ -9,7 +9,7 @@ import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -128,10 +128,16 @@ class DepthJob:
                 )
 
 
-def make_depth(
-    pictures: Sequence[Path], out: Path, job: DepthJob, *, owns_out: bool = False
-) -> tuple[Summary, list[Note]]:
-    """Write all the results for a pair to `out` atomically. Returns the summary and user-facing notes.
+class MadeDepth(NamedTuple):
+    """Summary of a pair's results, notes on its pictures and files, and warnings of its likely defects."""
+
+    summary: Summary
+    notes: list[Note]
+    warnings: list[Note]
+
+
+def make_depth(pictures: Sequence[Path], out: Path, job: DepthJob, *, owns_out: bool = False) -> MadeDepth:
+    """Write all the results for a pair to `out` atomically.
 
     Files in `out` that are not of an earlier result are replaced only with `owns_out`, for a folder that no
     one else writes to.
@@ -144,8 +150,8 @@ def make_depth(
     with replacing_together(out, tuple(FILES), () if owns_out else files) as folder:
         result = run(prepared, matcher, job.options)
         result = replace(result, command=job.command, name_of=job.name_of)
-        notes = [*result.notes, *left_out, *write_files(folder, files, result), *result.warnings()]
-    return result.summary, notes
+        notes = [*result.notes, *left_out, *write_files(folder, files, result)]
+        return MadeDepth(result.summary, notes, result.warnings())
 
 
 def job_facts(job: DepthJob) -> dict[str, Any]:

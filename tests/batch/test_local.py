@@ -145,7 +145,9 @@ def test_a_bad_pair_is_reported_and_the_next_run_processes_only_unfinished_and_c
     write_image(folder / "left" / "03.png", read_image(folder / "left" / "03.png")[::-1])
     (out / "00" / "disparity.pfm").unlink()
     tally, shown = run_quietly(folder, out, processes=1)
-    assert tally == LocalTally(done=3, skipped=1, failed=())
+    assert tally == LocalTally(
+        done=3, skipped=1, failed=(), warned=("03",)
+    )  # its left picture is upside down
     after = read_write_times_ns(out)
     assert {name for name in after if after[name] != before.get(name)} == {"00", "01", "03"}
     assert [row["error"] for row in read_summary(out).values()] == [""] * 4
@@ -245,6 +247,22 @@ def test_a_killed_or_interrupted_batch_resumes_but_not_while_another_one_runs(tm
     assert not list(out.rglob(".*"))
 
 
+def test_pairs_with_warnings_are_counted_and_the_table_has_the_warnings(tmp_path, capsys):
+    folder, out = write_pairs(tmp_path / "pairs", 8), tmp_path / "out"
+    for name in [f"{index:02d}.png" for index in range(1, 7)]:
+        upside_down = read_image(folder / "right" / name)[::-1]
+        write_image(folder / "right" / name, upside_down)
+    assert run_batch_command(find_pairs_in(folder), out, JOB, processes=2) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        f"{out}: 8 pairs: 8 made",
+        "with warnings: 6 (01, 02, 03, 04, 05, ...); see the column warnings of the table",
+        f"table: {out / 'summary.csv'}",
+    ]
+    rows = read_summary(out)
+    assert rows["01"]["warnings"].startswith("expected two pictures of the same scene, found ")
+    assert [rows[name][column] for name in ("00", "07") for column in ("warnings", "notes")] == [""] * 4
+
+
 def test_a_pair_that_kills_its_process_is_named_and_affects_no_other_pair(tmp_path, capsys):
     folder, out = write_pairs(tmp_path / "pairs", 3), tmp_path / "out"
     first, second, third = find_pairs_in(folder).pairs
@@ -255,6 +273,7 @@ def test_a_pair_that_kills_its_process_is_named_and_affects_no_other_pair(tmp_pa
         "done": 2,
         "skipped": 0,
         "failed": {"01": "its process was killed; did it run out of memory?"},
+        "warned": [],
         "summary": str(out / "summary.csv"),
     }
     assert "01: its process was killed" in printed.err

@@ -147,7 +147,7 @@ def test_a_graph_that_rejects_its_input_is_blamed_on_the_file(tmp_path):
 @pytest.mark.parametrize("provider", HERE)
 def test_a_result_names_its_provider_unless_it_is_the_cpu(pictures, tmp_path, provider):
     job = DepthJob(backend=Backend(provider=provider), always=("disparity.pfm",))
-    summary, _ = make_depth(pictures, tmp_path / "out", job)
+    summary, *_ = make_depth(pictures, tmp_path / "out", job)
     assert summary.model == ("small" if provider == "cpu" else f"small on {provider}")
 
 

@@ -62,7 +62,7 @@ def test_the_files_that_are_written_by_default(folder):
 
 
 def test_all_files_agree(folder):
-    _, notes = make_depth(PICTURES, Path("out"), replace(WITH_CAMERA, files=("all",)))
+    _, notes, _ = make_depth(PICTURES, Path("out"), replace(WITH_CAMERA, files=("all",)))
     assert names_in("out") == set(FILES)
     assert notes == []
     out, disparity_px = Path("out"), read_pfm("out/disparity.pfm")
@@ -96,7 +96,7 @@ def test_the_left_picture_is_written_where_the_maps_fit_none_of_the_user_s(folde
     assert "matched_left.png" not in names_in("sound")
     make_depth(PICTURES, Path("asked"), replace(PLAIN, files=("matched_left.png",)))
     np.testing.assert_array_equal(read_image("asked/matched_left.png"), read_image("left.png"))
-    _, notes = make_depth(PICTURES[::-1], Path("swapped"), PLAIN)
+    _, notes, _ = make_depth(PICTURES[::-1], Path("swapped"), PLAIN)
     assert any("swapped back" in str(note) for note in notes)
     np.testing.assert_array_equal(read_image("swapped/matched_left.png"), read_image("left.png"))
     assert "the left picture to which the maps belong" in Path("swapped/report.html").read_text()
@@ -114,7 +114,7 @@ def test_a_rectified_pair_s_maps_have_their_left_picture_beside_them(folder):
     left, right = (read_image(TEXTURED / name)[:, :320] for name in ("left.png", "right.png"))
     write_image("left.png", np.ascontiguousarray(left[:-12]))
     write_image("right.png", np.ascontiguousarray(right[12:]))
-    _, notes = make_depth(PICTURES, Path("out"), PLAIN)
+    _, notes, _ = make_depth(PICTURES, Path("out"), PLAIN)
     assert any(str(note).startswith("rectified: ") for note in notes)
     matched = read_image("out/matched_left.png")
     assert matched.shape == left[:-12].shape
@@ -164,7 +164,7 @@ def test_metres_without_a_camera_are_refused_before_anything_is_written(folder, 
 
 
 def test_all_without_a_camera_leaves_out_files_in_metres_with_a_note(folder):
-    _, notes = make_depth(PICTURES, Path("out"), DepthJob(files=("all",)))
+    _, notes, _ = make_depth(PICTURES, Path("out"), DepthJob(files=("all",)))
     assert names_in("out") == {
         *ALWAYS,
         "disparity_scaled.png",
@@ -186,7 +186,7 @@ def test_a_pair_without_points_gets_the_other_files_and_a_note(folder):
     for name in PICTURES:
         Image.new("RGB", (96, 64)).save(name)
     job = replace(WITH_CAMERA, files=("cloud.ply", "mesh.glb"))
-    _, notes = make_depth(PICTURES, Path("out"), job)
+    _, notes, _ = make_depth(PICTURES, Path("out"), job)
     assert names_in("out") == {*ALWAYS, "depth.png"}
     assert [note.text[:13] for note in notes if note.text.startswith("no ")] == [
         "no cloud.ply:",
