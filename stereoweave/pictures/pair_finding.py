@@ -35,8 +35,10 @@ _OTHER_SIDES = _SIDES | {right: left for left, right in _SIDES.items()}
 # end of a name.
 _MARK = re.compile(
     r"(?<![A-Za-z])(?:left|right|LEFT|RIGHT)(?![a-z])|(?:Left|Right)(?![a-z])"
-    r"|^[lLrR](?=$|[ _.-])|(?<![A-Za-z])[lLrR]$|^im[01]$|(?<![A-Za-z])cam[01](?![A-Za-z0-9])"
+    r"|^[lLrR](?=$|[ _.-])|(?<![A-Za-z])[lLrR]$|^im[01]$"
 )
+# In paths without such a mark, because cam0_left.png is a left picture.
+_CAMERA_MARK = re.compile(r"(?<![A-Za-z])cam[01](?![A-Za-z0-9])")
 _NOT_IN_NAMES = re.compile(r'[<>:"/\\|?*\x00-\x1f]')
 # Names of Windows devices, and of a batch's own files and folders.
 _TAKEN = re.compile(
@@ -162,8 +164,8 @@ def find_pairs_among(folder: str | Path, paths: Iterable[str]) -> Listed:
     right/a.png, a_L.png and a_R.png, left_01.png and right_01.png, im0.png and im1.png, cam0/a.png and
     cam1/a.png. If one picture is missing, the pair is still listed, and fails when it is read. A file with
     both views is also a pair. A camera raw file counts only if no picture beside it has its name. If there is
-    no such pair or file, every picture is taken to hold both views. A calib.txt beside left.png or im0.png
-    belongs to that pair. Output folders of batches are ignored.
+    no such pair or file, every picture is taken to hold both views. A calib.txt beside left.png, im0.png or
+    cam0.png belongs to that pair. Output folders of batches are ignored.
 
     Args:
         folder: Path or URL of the folder; a pair whose name consists only of marks is named after the folder.
@@ -302,10 +304,17 @@ def _list_parents(path: str) -> list[str]:
 
 
 def _pair_by_marks(paths: Sequence[str]) -> list[tuple[str, str]]:
-    """Pair the paths that contain a mark, as (left, right); return an empty list if no pair is complete."""
+    """Pair the paths that contain a mark, as (left, right); return an empty list if no pair is complete.
+
+    Numbers of cameras are marks only if no pair is complete without them.
+    """
+    return _pair_by_mark(_MARK, paths) or _pair_by_mark(_CAMERA_MARK, paths)
+
+
+def _pair_by_mark(mark: re.Pattern[str], paths: Sequence[str]) -> list[tuple[str, str]]:
     there, pairs, settled = set(paths), set(), set()
     for path in paths:
-        if path not in settled and (marked := _swap_sides(path)):
+        if path not in settled and (marked := _swap_sides(mark, path)):
             others, is_left = marked
             partner = next((other for other in others if other in there), others[0])
             pairs.add((path, partner) if is_left else (partner, path))
@@ -314,14 +323,14 @@ def _pair_by_marks(paths: Sequence[str]) -> list[tuple[str, str]]:
     return sorted(pairs) if any(there.issuperset(pair) for pair in pairs) else []
 
 
-def _swap_sides(path: str) -> tuple[list[str], bool] | None:
+def _swap_sides(mark: re.Pattern[str], path: str) -> tuple[list[str], bool] | None:
     """Return the other picture's possible paths, and whether this picture is the left one.
 
     The other path has all marks swapped, or only the last mark. Return None if the path has no marks.
     """
     stem, ending = splitext(path)
     parts = stem.split("/")
-    swapped = [_swap_marks(part) for part in parts]
+    swapped = [_swap_marks(mark, part) for part in parts]
     places = [place for place, (part, other) in enumerate(zip(parts, swapped, strict=True)) if part != other]
     if not places:
         return None
@@ -329,7 +338,7 @@ def _swap_sides(path: str) -> tuple[list[str], bool] | None:
     others = ["/".join(swapped) + ending]
     if len(places) > 1:
         others.append("/".join((*parts[:last], *swapped[last:])) + ending)
-    return others, _MARK.findall(parts[last])[-1] in _SIDES
+    return others, mark.findall(parts[last])[-1] in _SIDES
 
 
 def _split_path(path: str) -> list[str]:
@@ -339,8 +348,8 @@ def _split_path(path: str) -> list[str]:
 
 # Cached, because most pictures are in the same folder as the previous one.
 @lru_cache(maxsize=1000)
-def _swap_marks(part: str) -> str:
-    return _MARK.sub(lambda mark: _OTHER_SIDES[mark[0]], part)
+def _swap_marks(mark: re.Pattern[str], part: str) -> str:
+    return mark.sub(lambda found: _OTHER_SIDES[found[0]], part)
 
 
 def _glob_files(pattern: str) -> list[Path]:
@@ -399,13 +408,21 @@ def _check_names(names: Iterable[tuple[str, str | Path]]) -> None:
 
 def _name_pair(path: str, pictures: int, whole: str) -> str:
     """Name a pair after its first picture's path without marks, or after the folder if nothing remains."""
-    parts = _split_path(path) if pictures == 1 else list(map(_strip_marks, _split_path(path)))
+    parts = _split_path(path)
+    if pictures == 2:
+        mark = _find_mark(parts)
+        parts = [_strip_marks(mark, part) for part in parts]
     return _sanitize("_".join(filter(None, parts)) or whole)
 
 
 @lru_cache(maxsize=1000)
-def _strip_marks(part: str) -> str:
-    return "_".join(filter(None, (piece.strip(" _.-") for piece in _MARK.split(part))))
+def _strip_marks(mark: re.Pattern[str], part: str) -> str:
+    return "_".join(filter(None, (piece.strip(" _.-") for piece in mark.split(part))))
+
+
+def _find_mark(parts: Sequence[str]) -> re.Pattern[str]:
+    """Return the pattern of the marks that say which side a path is of."""
+    return _MARK if any(map(_MARK.search, parts)) else _CAMERA_MARK
 
 
 def _sanitize(name: str) -> str:
@@ -416,4 +433,5 @@ def _sanitize(name: str) -> str:
 
 def _owns_calibration(path: str, pictures: int) -> bool:
     """Return whether a calibration file beside a pair's first picture belongs to that pair alone."""
-    return pictures == 2 and _MARK.fullmatch(_split_path(path)[-1]) is not None
+    parts = _split_path(path)
+    return pictures == 2 and _find_mark(parts).fullmatch(parts[-1]) is not None

@@ -39,6 +39,10 @@ def listed(folder: Path, pairs: list[NamedPair]) -> dict[str, tuple[str, ...]]:
         ("castle", "castle/im0.png", "castle/im1.png"),
         ("mav0_data_14", "mav0/cam0/data/14.png", "mav0/cam1/data/14.png"),
         ("rig_07", "rig_cam0_07.png", "rig_cam1_07.png"),
+        ("cam0", "cam0_left.png", "cam0_right.png"),
+        ("cam0_1", "L_cam0_1.png", "R_cam0_1.png"),
+        ("cam0", "left/cam0.png", "right/cam0.png"),
+        ("cam0_a", "cam0/left/a.png", "cam0/right/a.png"),
         ("castle_0001", "castle/Left/0001.png", "castle/Right/0001.png"),
         ("Img8bit_a_1_Img8bit", "leftImg8bit/a_1_leftImg8bit.png", "rightImg8bit/a_1_rightImg8bit.png"),
         ("img_7", "imgLeft/img_7.tif", "imgRight/img_7.tif"),
@@ -55,6 +59,25 @@ def test_a_folders_pairs_are_found_by_the_marks_of_their_sides(tmp_path, name, l
 def test_a_pair_right_in_the_folder_has_the_folders_name(tmp_path):
     folder = put(tmp_path / "castle", "left.png", "right.png")
     assert listed(folder, find_pairs_in(folder).pairs) == {"castle": ("left.png", "right.png")}
+
+
+@pytest.mark.parametrize(
+    "pairs",
+    [
+        {"cam0": ("cam0_L.png", "cam0_R.png"), "cam1": ("cam1_L.png", "cam1_R.png")},
+        {f"cam{rig}_a": (f"cam{rig}/left/a.png", f"cam{rig}/right/a.png") for rig in range(2)},
+    ],
+)
+def test_cameras_that_have_two_eyes_each_are_two_rigs(tmp_path, pairs):
+    folder = put(tmp_path, *(path for pair in pairs.values() for path in pair))
+    assert listed(folder, find_pairs_in(folder).pairs) == pairs
+
+
+def test_numbers_of_cameras_mean_nothing_beside_pairs_of_left_and_right(tmp_path):
+    folder = put(tmp_path, "cam0/1.png", "cam1/1.png", "left_1.png", "right_1.png")
+    found = find_pairs_in(folder)
+    assert listed(folder, found.pairs) == {"1": ("left_1.png", "right_1.png")}
+    assert "2 pictures skipped" in found.notes[0]
 
 
 def test_words_that_only_begin_like_a_mark_are_none(tmp_path):
