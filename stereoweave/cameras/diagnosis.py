@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from stereoweave.cameras.alignment import RECTIFY, Alignment, check_pair
+from stereoweave.cameras.unit_check import note_units
 from stereoweave.errors import Note, Remedy
 from stereoweave.stereo import Estimate, StereoPair
 
@@ -36,14 +37,17 @@ def find_problems(
 
 
 def _check_camera(pair: StereoPair, alignment: Alignment) -> list[Note]:
-    """Return a note if the camera puts much of the scene beyond infinity."""
-    if pair.camera is None or pair.camera.doffs_px or not alignment.needs_doffs:
+    """Return notes on a camera in a wrong unit, or one that puts much of the scene beyond infinity."""
+    if pair.camera is None:
         return []
+    units = note_units(pair.camera, pair.left.shape[1])
+    if pair.camera.doffs_px or not alignment.needs_doffs:
+        return units
     text = (
         f"depths in metres are wrong: {alignment.negative_percent:.0f} % of the matches have negative "
         "disparities, which doffs of 0 px put beyond infinity"
     )
-    return [Note(text, GIVE_DOFFS)]
+    return [*units, Note(text, GIVE_DOFFS)]
 
 
 def _find_defects(pair: StereoPair, estimate: Estimate, alignment: Alignment, remedy: Remedy) -> list[Note]:

@@ -12,7 +12,6 @@ from stereoweave.cameras.rectify import Rectified, rectify
 from stereoweave.cameras.rig import pair_size_px
 from stereoweave.cameras.sphere_windows import PerspectiveWindow
 from stereoweave.cameras.spherical import SphereRequest
-from stereoweave.cameras.unit_check import note_units
 from stereoweave.errors import Note, Remedy, StereoweaveError
 from stereoweave.io.exif import Lens
 from stereoweave.pictures.loading import Opened, open_pictures
@@ -91,15 +90,8 @@ def prepare(pictures: Sequence[Path], request: Request) -> Prepared:
             gives only one of focal length and baseline, and EXIF lacks the other.
     """
     opened = open_pictures(pictures, request.format, request.sphere)
-    make_ready = _prepare_window if opened.sphere else _prepare_pair
-    found = make_ready(pictures, opened, request)
-    camera = found.pair.camera
-    doubts = note_units(camera, found.pair.left.shape[1]) if camera else ()
-    return replace(found, notes=(*found.notes, *doubts))
-
-
-def _prepare_pair(pictures: Sequence[Path], opened: Opened, request: Request) -> Prepared:
-    """Prepare a pair of perspective images."""
+    if opened.sphere:
+        return _prepare_window(pictures, opened, request)
     if request.calibration:
         ready = _apply_calibration(opened.pair, request.calibration, bool(request.rectify))
         return Prepared(

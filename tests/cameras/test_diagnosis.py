@@ -115,3 +115,35 @@ def test_no_real_pair_gets_a_line(testdata):
     for folder in folders[::3]:
         pair = StereoPair(left=read_image(folder / "left.png"), right=read_image(folder / "right.png"))
         assert find_problems(pair, matcher.estimate(pair.left, pair.right)) == [], folder
+
+
+def notes_on_camera(pair, focal_px, baseline_m):
+    camera = StereoCamera.centred(pair.left, focal_px=focal_px, baseline_m=baseline_m)
+    found = find_problems(replace(pair, camera=camera), estimate_of(pair, 0.9))
+    return [str(note) for note in found]
+
+
+@pytest.mark.parametrize(
+    ("baseline_m", "apart"),
+    [(193.0, "193.0 m"), (5.5, "5.5 m"), (0.000193, "0.19 mm"), (0.00099, "0.99 mm")],
+)
+def test_a_baseline_in_a_wrong_unit_is_noted(example, baseline_m, apart):
+    assert notes_on_camera(example, 600.0, baseline_m) == [
+        f"unlikely depths in metres: the cameras are {apart} apart; "
+        "check the unit of the baseline (calibration, baseline_m)"
+    ]
+
+
+def test_a_focal_length_in_millimetres_is_noted(example):
+    assert example.left.shape[1] == 640
+    # 320 px are 9.143 times 35 px, and the angle whose tangent is 9.143 is 83.76 degrees.
+    assert notes_on_camera(example, 35.0, 0.1) == [
+        "unlikely depths in metres: a focal length of 35 px means a field of view of 168 degrees; "
+        "check that the focal length is in pixels (calibration, focal_px)"
+    ]
+
+
+# A window of 150 degrees, the widest of a VR180 picture, has 320 / tan(75 degrees) = 85.7 px.
+@pytest.mark.parametrize(("focal_px", "baseline_m"), [(85.7, 0.002), (5000.0, 4.0)])
+def test_a_wide_lens_and_a_long_rig_are_not_doubted(example, focal_px, baseline_m):
+    assert notes_on_camera(example, focal_px, baseline_m) == []
