@@ -210,8 +210,8 @@ def check_position(position: float, *, strength: float = 1.0, up: float = 0.0, f
     seen_from = 0.5 + strength * (position - 0.5)
     if not FIRST_POSITION <= seen_from <= LAST_POSITION:
         between = f"{FIRST_POSITION:g} to {LAST_POSITION:g} (0 is the left camera and 1 the right one)"
-        if strength == 1:
-            raise StereoweaveError(f"expected {between}, got {seen_from:g}", setting="position")
+        if not FIRST_POSITION <= position <= LAST_POSITION:
+            raise StereoweaveError(f"expected {between}, got {position:g}", setting="position")
         found = f"{seen_from:g} (position {position:g} at strength {strength:g})"
         raise StereoweaveError(f"expected views from {between}, got {found}", setting="strength")
     for name, value in (("up", up), ("forward", forward)):

@@ -276,15 +276,20 @@ def test_positions_that_can_be_rendered_are_accepted(positions, strength):
 @pytest.mark.parametrize(
     ("positions", "strength", "found"),
     [
-        ((7.0,), 1.0, "got 7"),
-        ((float("nan"),), 1.0, "got nan"),
-        ((0.0, 1.0), 4.0, r"got -1.5 \(position 0 at strength 4\)"),
-        ((0.5, 1.5), 2.0, r"got 2.5 \(position 1.5 at strength 2\)"),
-        ((0.5,), float("nan"), "got nan"),
+        ((7.0,), 1.0, "position: expected -1 to 2 .*, got 7"),
+        ((5.0,), 0.5, "position: expected -1 to 2 .*, got 5"),
+        ((float("nan"),), 1.0, "position: expected -1 to 2 .*, got nan"),
+        ((0.0, 1.0), 4.0, r"strength: expected views from -1 to 2 .*, got -1.5 \(position 0 at .*\)"),
+        (
+            (0.5, 1.5),
+            2.0,
+            r"strength: expected views from -1 to 2 .*, got 2.5 \(position 1.5 at .*\)",
+        ),
+        ((0.5,), float("nan"), "strength: expected views from -1 to 2 .*, got nan"),
     ],
 )
 def test_positions_that_cannot_be_rendered_are_refused(positions, strength, found):
-    with pytest.raises(StereoweaveError, match=f"expected (views from )?-1 to 2 .*, {found}"):
+    with pytest.raises(StereoweaveError, match=f"^{found}"):
         check_positions(positions, strength)
 
 
