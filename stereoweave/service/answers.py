@@ -9,6 +9,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from stereoweave.cameras.alignment import SWAPPED
 from stereoweave.cameras.rectify import crop
 from stereoweave.errors import Note, StereoweaveError
 from stereoweave.io.decoding import MOST_PIXELS, open_picture
@@ -227,11 +228,12 @@ def _write_map(path: Path, result: Result) -> None:
         FILES[path.name](path, result)
     except RangeError as error:
         summary = result.summary
-        causes = [f"{problem.format(field_name)}; or " for problem in result.warnings()]
+        swapped = summary.disparity_min_px < 0 and SWAPPED in result.warnings()
+        cause = f"{SWAPPED.format(field_name)}; or " if swapped else ""
         raise StereoweaveError(
             f"{path.name}: expected disparities from 0 to 255.99 px, the range of a PNG, found "
             f"{summary.disparity_min_px:.2f} to {summary.disparity_max_px:.2f} px; "
-            f"{''.join(causes)}request pfm, npy or tiff"
+            f"{cause}request pfm, npy or tiff"
         ) from error
 
 
