@@ -15,7 +15,10 @@ from stereoweave.io.decoding import ENDINGS
 from stereoweave.io.images import read_image
 from stereoweave.stereo import StereoCamera
 from stereoweave.video.sphere_marks import SphereMark
-from stereoweave.video.track_frame import SAMPLED_AT, TrackFrame
+from stereoweave.video.track_frame import TrackFrame
+
+# Where in a track its `samples` are taken, as shares of its length.
+SAMPLED_AT = 0.1, 0.3, 0.5, 0.7, 0.9
 
 
 class PictureTrack:

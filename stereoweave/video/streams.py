@@ -116,6 +116,11 @@ def is_frame(packet: "av.Packet[Any]") -> bool:
     return bool(packet.size) and not packet.is_discard
 
 
+def describe_error(error: "av.error.FFmpegError") -> str:
+    """Return FFmpeg's own words for an error, in lower case."""
+    return (error.strerror or "error in FFmpeg").lower()
+
+
 def _describe_unopened(path: Path, error: "av.error.FFmpegError") -> str:
     """Describe what was found instead of a video, for an error message."""
     beginning = b""
@@ -127,8 +132,3 @@ def _describe_unopened(path: Path, error: "av.error.FFmpegError") -> str:
     if beginning[4:] in _MP4_BOXES:
         found += "; if the file was cut off, its index is lost: record or download it again"
     return found
-
-
-def describe_error(error: "av.error.FFmpegError") -> str:
-    """Return FFmpeg's own words for an error, in lower case."""
-    return (error.strerror or "error in FFmpeg").lower()

@@ -6,9 +6,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-# Where in a track its `samples` are taken, as shares of its length.
-SAMPLED_AT = 0.1, 0.3, 0.5, 0.7, 0.9
-
 
 class TrackFrame(NamedTuple):
     """Decoded frame.

@@ -16,7 +16,7 @@ from stereoweave.errors import FormatError, Note, Remedy, StereoweaveError
 from stereoweave.stereo import StereoCamera
 from stereoweave.video.colours import convert_to_fine, convert_to_rgb, hdr_colours, name_hdr
 from stereoweave.video.packings import FRAME_SEQUENTIAL
-from stereoweave.video.picture_track import PictureTrack, list_picture_files
+from stereoweave.video.picture_track import SAMPLED_AT, PictureTrack, list_picture_files
 from stereoweave.video.spatial import RIGHT, Stereo3D, ViewPair, is_spatial, pair_views, read_stereo3d
 from stereoweave.video.sphere_marks import read_sphere
 from stereoweave.video.streams import decode, drop_corrupt, open_stream
@@ -28,7 +28,7 @@ from stereoweave.video.timestamps import (
     read_stamps,
     separate_duplicates,
 )
-from stereoweave.video.track_frame import SAMPLED_AT, TrackFrame
+from stereoweave.video.track_frame import TrackFrame
 
 if TYPE_CHECKING:
     import av

@@ -1,9 +1,7 @@
 import re
 import sys
-from array import array
 from fractions import Fraction
 from itertools import pairwise
-from types import SimpleNamespace
 
 import av
 import numpy as np
@@ -26,7 +24,6 @@ from stereoweave.io.images import write_image
 from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS, detect_layout, measure_resemblance
 from stereoweave.video import tracks
 from stereoweave.video.reader import open_video
-from stereoweave.video.timestamps import fill_missing, number_by_rank, separate_duplicates
 from stereoweave.video.tracks import open_track
 
 BEFORE = "damaged: replaced by the frame before it"
@@ -290,23 +287,6 @@ def test_a_repeated_time_stamp_delays_only_its_own_frame(tmp_path):
     assert_same(video.frames(2), list(video.frames())[2:])
 
 
-def test_a_duplicate_is_delayed_by_one_frame_if_there_is_room():
-    assert separate_duplicates([0, 40, 40, 200, 200], frame_steps=40) == (
-        array("q", [0, 40, 80, 200, 240]),
-        [2, 4],
-    )
-
-
-def test_times_increase_even_without_room_between_duplicates():
-    steps, moved = separate_duplicates([0, 5, 5, 5, 6, 9], frame_steps=4)
-    assert list(steps) == [0, 5, 6, 7, 8, 9]
-    assert moved == [2, 3]
-
-
-def test_a_missing_time_stamp_is_replaced_by_the_previous_one():
-    assert fill_missing([None, 40, None, 120]) == [40, 40, 40, 120]
-
-
 @pytest.mark.parametrize(("key_every", "spoilt"), [("1", []), ("5", [4])])
 def test_a_frame_lost_without_time_stamps_is_the_one_that_is_bridged(tmp_path, key_every, spoilt):
     options = {"bf": "0", "g": key_every}
@@ -321,13 +301,6 @@ def test_a_frame_lost_without_time_stamps_is_the_one_that_is_bridged(tmp_path, k
     video = open_video([path])
     assert problems(video) == {3: BEFORE} | dict.fromkeys(spoilt, SPOILT)
     assert_same(list(video.frames())[5:], whole[5:])
-
-
-def test_with_b_frames_a_lost_frame_is_noticed_at_the_next_key_frame():
-    # The file contains I0 P1 B2 B3 P4 I5 P6, and B3 is lost.
-    shown = [SimpleNamespace(opaque=rank, key_frame=rank in (0, 5)) for rank in (0, 2, 1, 4, 5, 6)]
-    decoder = SimpleNamespace(codec_context=SimpleNamespace(has_b_frames=True))
-    assert [number for number, _ in number_by_rank(iter(shown), decoder)] == [0, 1, 2, 3, 5, 6]
 
 
 def test_a_folder_of_pictures_is_a_video_in_numerical_order(tmp_path):
