@@ -61,7 +61,7 @@ class LocalTally:
     done: int
     skipped: int
     failed: tuple[tuple[str, str], ...]
-    warned: tuple[str, ...] = ()
+    warned: tuple[str, ...]
 
 
 def run_batch(
@@ -339,6 +339,5 @@ def _read_row(folder: Path) -> dict[str, Any]:
         return {}
     row = {name: facts["summary"][name] for name in _NUMBERS}
     row |= {"name": folder.name, "pictures": " + ".join(facts["summary"]["pictures"])}
-    # Earlier versions wrote the warnings among the notes.
-    lines = {kind: "; ".join(facts.get(kind, ())) for kind in ("notes", "warnings")}
+    lines = {kind: "; ".join(facts[kind]) for kind in ("notes", "warnings")}
     return row | {"seconds": facts["seconds"], **lines}

@@ -199,7 +199,8 @@ class ChunkWorker:
         if calibration and not job.request.calibration:
             job = replace(job, request=replace(job.request, calibration=calibration))
         with self._open_results(entry, scratch) as out:
-            summary, notes, warnings = make_depth(pictures, out, job, owns_out=True)
+            made = make_depth(pictures, out, job, owns_out=True)
+        summary = made.summary
         return {
             "disparity_min_px": summary.disparity_min_px,
             "disparity_median_px": summary.disparity_median_px,
@@ -207,7 +208,7 @@ class ChunkWorker:
             "confident_percent": summary.confident_percent,
             "width_px": summary.width_px,
             "height_px": summary.height_px,
-            "checks": [note.format(job.name_of) for note in (*notes, *warnings)],
+            "checks": [note.format(job.name_of) for note in made.all_notes],
             "files": _list_names(out),
         }
 

@@ -55,7 +55,7 @@ PicturesOrFolder = Annotated[
     typer.Argument(
         metavar="PICTURE",
         help="LEFT RIGHT, two pictures of the same size; or one picture that holds both views; or a folder "
-        "of pairs, recognised by names such as left/1.png, 1_L.jpg, im0.png or 1.mpo.",
+        "of pairs, recognised by names such as left/1.png, 1_L.jpg, im0.png, cam0/1.png or 1.mpo.",
     ),
 ]
 Left = Annotated[
@@ -150,9 +150,9 @@ def depth(  # noqa: PLR0913 - each is an option of the command line
         from stereoweave.batch.local import run_batch_command
 
         raise typer.Exit(run_batch_command(found, out, job, processes=jobs, as_json=as_json))
-    summary, notes, warnings = make_depth(pictures, out, job)
-    lines = [note.format(job.name_of) for note in (*notes, *warnings)]
-    (_print_json if as_json else _print_summary)(summary, lines, out)
+    made = make_depth(pictures, out, job)
+    lines = [note.format(job.name_of) for note in made.all_notes]
+    (_print_json if as_json else _print_summary)(made.summary, lines, out)
 
 
 def _write_whole(pictures: Sequence[Path], out: Path, job: "DepthJob", *, many: bool, as_json: bool) -> None:

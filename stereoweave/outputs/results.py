@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stereoweave import __version__
+from stereoweave.arguments import check_choice
 from stereoweave.cameras.calibration_files import read_calibration_bytes
 from stereoweave.cameras.spherical import SphereRequest
 from stereoweave.errors import NameOf, Note, StereoweaveError, keyword
@@ -122,21 +123,23 @@ class DepthJob:
 
     def __post_init__(self) -> None:
         for file in self.files:
-            if file not in FILES and file != ALL:
-                raise StereoweaveError(
-                    f"expected {ALL} or one of {', '.join(FILES)}, found {file!r}", setting="files"
-                )
+            check_choice("files", file, (ALL, *FILES))
 
 
-class MadeDepth(NamedTuple):
+class DepthOutcome(NamedTuple):
     """Summary of a pair's results, notes on its pictures and files, and warnings of its likely defects."""
 
     summary: Summary
     notes: list[Note]
     warnings: list[Note]
 
+    @property
+    def all_notes(self) -> list[Note]:
+        """The notes, and then the warnings."""
+        return [*self.notes, *self.warnings]
 
-def make_depth(pictures: Sequence[Path], out: Path, job: DepthJob, *, owns_out: bool = False) -> MadeDepth:
+
+def make_depth(pictures: Sequence[Path], out: Path, job: DepthJob, *, owns_out: bool = False) -> DepthOutcome:
     """Write all the results for a pair to `out` atomically.
 
     Files in `out` that are not of an earlier result are replaced only with `owns_out`, for a folder that no
@@ -151,7 +154,7 @@ def make_depth(pictures: Sequence[Path], out: Path, job: DepthJob, *, owns_out: 
         result = run(prepared, matcher, job.options)
         result = replace(result, command=job.command, name_of=job.name_of)
         notes = [*result.notes, *left_out, *write_files(folder, files, result)]
-        return MadeDepth(result.summary, notes, result.warnings())
+        return DepthOutcome(result.summary, notes, result.warnings())
 
 
 def job_facts(job: DepthJob) -> dict[str, Any]:

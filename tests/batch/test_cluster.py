@@ -97,14 +97,14 @@ def test_bad_pairs_become_rows_and_the_next_run_processes_missing_changed_and_ne
     assert dict(tally.named) == {name: rows[name]["error"] for name in ("01", "02", "alone")}
 
     pictures = [source / side / "03.png" for side in ("left", "right")]
-    summary, notes = make_depth(pictures, tmp_path / "alone", replace(JOB, backend=Backend(threads=1)))
+    made = make_depth(pictures, tmp_path / "alone", replace(JOB, backend=Backend(threads=1)))
     for file in JOB.always:
         assert (out / "03" / file).read_bytes() == (tmp_path / "alone" / file).read_bytes()
     row = rows["03"]
     assert (row["width_px"], row["height_px"], row["error"]) == (64, 48, None)
-    assert row["disparity_median_px"] == pytest.approx(summary.disparity_median_px)
-    assert row["confident_percent"] == pytest.approx(summary.confident_percent)
-    assert (row["pictures"], row["checks"]) == (["03.png", "03.png"], notes)
+    assert row["disparity_median_px"] == pytest.approx(made.summary.disparity_median_px)
+    assert row["confident_percent"] == pytest.approx(made.summary.confident_percent)
+    assert (row["pictures"], row["checks"]) == (["03.png", "03.png"], made.all_notes)
 
     before = read_write_times_ns(out)
     for path, content in whole.items():

@@ -287,7 +287,7 @@ def test_a_model_file_replaced_during_a_batch_is_not_loaded(tmp_path):
     pairs = [first, ModelRemover(second.name, second.pictures)]
     job = replace(JOB, backend=Backend(model=model, threads=1))
     _load.cache_clear()
-    assert run_quietly(folder, out, job, pairs=pairs, processes=1)[0] == LocalTally(2, 0, ())
+    assert run_quietly(folder, out, job, pairs=pairs, processes=1)[0] == LocalTally(2, 0, (), ())
     assert model.read_bytes() == b"no network"
     assert _load.cache_info().currsize == 0  # this process matches nothing
 
@@ -297,7 +297,7 @@ def test_another_job_or_an_unrelated_folder_is_refused_before_processing_starts(
     calibration = tmp_path / "calib.txt"
     calibration.write_text("first")
     job = DepthJob(request=Request(calibration=calibration))
-    assert run_quietly(folder, out, job, pairs=[])[0] == LocalTally(done=0, skipped=0, failed=())
+    assert run_quietly(folder, out, job, pairs=[])[0] == LocalTally(done=0, skipped=0, failed=(), warned=())
     with pytest.raises(
         StereoweaveError, match='batch.json: expected model = "base" for this run, found "small"'
     ):
@@ -324,7 +324,7 @@ def test_a_scenes_own_calibration_is_used_unless_one_is_given_for_all_scenes(tmp
     for name in ("left.png", "right.png", "calib.txt"):
         (folder / "room" / name).write_bytes((TEXTURED / name).read_bytes())
     tally, _ = run_quietly(folder, out, processes=1)
-    assert tally == LocalTally(done=1, skipped=0, failed=())
+    assert tally == LocalTally(done=1, skipped=0, failed=(), warned=())
     own_mm = read_pixels(out / "room" / "depth.png", "I;16")
 
     calibration = tmp_path / "twice.txt"
