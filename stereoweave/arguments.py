@@ -1,4 +1,4 @@
-"""Type checks for arguments of the Python interface; each check raises a one-line StereoweaveError.
+"""Checks of arguments of the Python interface; each raises a one-line StereoweaveError.
 
 NumPy is imported only inside the functions, because the command line's help imports this module and must be
 fast.
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     import numpy as np
 
 _MOST_SHOWN = 60
+_MOST_MEANT = 3
 _LEAST_LIKENESS = 0.7  # "gpu" is no slip for "cpu"
 _DTYPES = {"f": "floats", "u": "uint8", "b": "booleans"}
 
@@ -54,18 +55,19 @@ def check_choice(
 ) -> None:
     """Require one of the names in `choices`; the error, of class `kind`, suggests what was probably meant."""
     names = list(choices)
-    if value not in names:
+    if not isinstance(value, str) or value not in names:
         message = f"expected one of {', '.join(names)}, found {describe(value)}"
-        raise kind(message + suggest(value, names), setting=setting)
+        hint = suggest(value, names) if isinstance(value, str) else ""
+        raise kind(message + hint, setting=setting)
 
 
-def suggest(value: object, names: Sequence[str]) -> str:
+def suggest(value: str, names: Sequence[str]) -> str:
     """Return "; did you mean ...?" with names that begin with a value, resemble it or have its initials."""
-    typed = str(value).lower().replace("-", "_").replace(" ", "_")
+    typed = value.lower().replace("-", "_").replace(" ", "_")
     longer = [typed] if typed in names else [name for name in names if typed and name.startswith(typed)]
-    by_initials = [name for name in names if "".join(part[0] for part in name.split("_")) == typed]
+    by_initials = [name for name in names if "".join(part[:1] for part in name.split("_")) == typed]
     meant = longer or get_close_matches(typed, names, 1, _LEAST_LIKENESS) or by_initials
-    return f"; did you mean {' or '.join(meant)}?" if meant else ""
+    return f"; did you mean {' or '.join(meant[:_MOST_MEANT])}?" if meant else ""
 
 
 def check_flag(name: str, value: object) -> None:

@@ -1,5 +1,6 @@
-"""Names that are no choice of a setting."""
+"""Choices of a setting, and what is suggested for a wrong one."""
 
+import numpy as np
 import pytest
 
 from stereoweave.arguments import check_choice
@@ -35,6 +36,11 @@ def test_nothing_is_suggested_for_what_resembles_no_name(typed):
     assert str(refused.value) == (
         f"layout: expected one of side_by_side, side_by_side_half, top_bottom, wiggle, found {typed!r}"
     )
+
+
+def test_an_array_of_names_is_no_choice():
+    with pytest.raises(StereoweaveError, match=r"^layout: expected one of .*, found ndarray of <U6 \[\]$"):
+        check_choice("layout", np.array("wiggle"), LAYOUTS)
 
 
 def test_a_choice_is_accepted():

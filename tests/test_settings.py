@@ -70,6 +70,8 @@ def find_settings() -> Iterator[tuple[str, str]]:
     """Yield each setting that an error or a remedy names, with its module."""
     for module, call in find_calls():
         values = [keyword.value for keyword in call.keywords if keyword.arg == "setting"]
+        if isinstance(call.func, ast.Name) and call.func.id == "check_choice":
+            values += call.args[:1]
         if is_remedy(call):
             values += [*call.args[1:], *(keyword.value for keyword in call.keywords)]
         for value in values:
@@ -91,7 +93,8 @@ SHARED_SETTINGS = {setting for module, setting in SETTINGS if module.split("/")[
 def test_a_command_has_an_option_for_each_setting():
     options = [option_names(command) for command in list_commands(typer.main.get_command(app))]
     unknown = {name for _, name in SETTINGS if not any(option_of(name) for option_of in options)}
-    assert unknown == {"split", "align", "start_s"}  # settings of recipes, of Python and of the page only
+    # Settings of recipes, of Python and of the page only, and an argument.
+    assert unknown == {"split", "align", "start_s", "texture", "scene"}
 
 
 def test_the_service_has_a_field_for_each_setting_that_it_offers():

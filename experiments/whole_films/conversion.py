@@ -11,6 +11,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import NamedTuple
 
+from stereoweave.arguments import check_choice
 from stereoweave.errors import StereoweaveError
 from stereoweave.video.reader import open_video
 
@@ -66,8 +67,7 @@ def measure_conversions(film: Path, outputs: Sequence[str] | None = None) -> lis
         StereoweaveError: An output is unknown, or the command fails.
     """
     for output in outputs or ():
-        if output not in OUTPUTS:
-            raise StereoweaveError(f"output: expected one of {', '.join(OUTPUTS)}, found {output!r}")
+        check_choice("output", output, OUTPUTS)
     width_px, height_px = open_video([film]).size_px
     original = _read(film)
     rows = []

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from stereoweave.arguments import suggest
 from stereoweave.cameras.rig import format_size
 from stereoweave.errors import FormatError, StereoweaveError
 
@@ -56,6 +57,7 @@ class Board:
         if self.dictionary is not None and self.dictionary not in names:
             raise StereoweaveError(
                 f"unknown marker dictionary {self.dictionary}; expected one of {', '.join(names)}"
+                + suggest(self.dictionary, names)
             )
 
     def __str__(self) -> str:

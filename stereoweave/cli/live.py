@@ -9,8 +9,9 @@ from typing import Annotated
 
 import typer
 
+from stereoweave.arguments import check_choice
 from stereoweave.cli.options import Model, OldFormat, Provider, Threads, replace_old_option
-from stereoweave.errors import StereoweaveError
+from stereoweave.errors import Remedy, StereoweaveError
 
 Sources = Annotated[
     list[str],
@@ -66,12 +67,14 @@ def live(  # noqa: PLR0913 - each is an option of the command line
     from stereoweave.video.packings import FRAME_PACKINGS
 
     format = replace_old_option(("--arrangement", arrangement), ("--format", format))
-    if format not in (None, *FRAME_PACKINGS) or (format and len(sources) > 1):
-        raise StereoweaveError(
-            f"expected one of {', '.join(FRAME_PACKINGS)}, for a single source with both views, "
-            f"found {format} for {' '.join(sources)}",
-            setting="format",
-        )
+    if format is not None:
+        check_choice("format", format, FRAME_PACKINGS)
+        if len(sources) > 1:
+            raise StereoweaveError(
+                f"expected a single source with both views, found {' '.join(sources)}",
+                setting="format",
+                remedy=Remedy("omit this setting"),
+            )
     rig = read_rig(calib) if calib else None
     matcher, tally = Backend(model=model, threads=threads, provider=provider).matcher(), LiveTally()
     with Screen(port) as screen, Capture(sources, loop=loop, format=format) as capture:

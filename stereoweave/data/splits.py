@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from stereoweave.arguments import check_choice
+from stereoweave.arguments import check_choice, suggest
 from stereoweave.data.frames import Frame
 from stereoweave.errors import StereoweaveError
 
@@ -41,7 +41,10 @@ def _read_rule(dataset: str, split: str) -> dict[str, Any]:
     check_choice("split", split, SPLITS)
     rules = tomllib.loads((files(__package__) / "split_rules" / f"{split}.toml").read_text(encoding="utf-8"))
     if dataset not in rules:
-        raise StereoweaveError(f"dataset to split: expected one of {', '.join(rules)}, found {dataset!r}")
+        raise StereoweaveError(
+            f"dataset to split: expected one of {', '.join(rules)}, found {dataset!r}"
+            + suggest(dataset, list(rules))
+        )
     return rules[dataset]
 
 

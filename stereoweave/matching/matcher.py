@@ -368,7 +368,7 @@ def model_file(model: str | Path) -> Path:
         names = list(dict.fromkeys([*shipped_models(), *MODES]))
         raise MatcherError(
             f"unknown model {name!r}; expected {', '.join(names)} or the path of an .onnx file"
-            + suggest(name, names)
+            + ("" if Path(name).suffix else suggest(name, names))
         )
     return _weights_folder() / f"{name}.onnx"
 

@@ -176,7 +176,7 @@ def _find_mixed_pixels(disparity_px: Float[np.ndarray, "h w"]) -> Bool[np.ndarra
 def _thin(known: Bool[np.ndarray, "h w"], most_points: int) -> tuple[Bool[np.ndarray, "h2 w2"], int]:
     """Subsample rows and columns with the smallest step that leaves at most `most_points` pixels."""
     if most_points < 1:
-        raise StereoweaveError(f"expected at least 1, found {most_points}", setting="most_points")
+        raise StereoweaveError(f"most_points: expected at least 1, found {most_points}")
     step_px = 1
     while np.count_nonzero(thinned := known[::step_px, ::step_px]) > most_points:
         step_px += 1

@@ -39,8 +39,7 @@ ERRORS = {
     "rectify both.png --format diagonal -o out": f"--format: expected one of {LAYOUTS}, mpo, jps, found "
     "'diagonal'",
     f"depth {PAIR} --write depth.npy -o out": f"depth.npy: {NO_CAMERA}",
-    f"depth {PAIR} --write x.obj -o out": "--write: expected all or one of "
-    f"{', '.join(FILES)}, found 'x.obj'",
+    f"depth {PAIR} --write x.obj -o out": f"--write: expected one of all, {', '.join(FILES)}, found 'x.obj'",
     f"measure {PAIR} --from 1,2 --to 3,4": NO_CAMERA,
     f"depth {PAIR} --raw --refined -o out": "--raw: cannot be combined with refined, because raw "
     "output is not post-processed; leave one of them out (--raw, --refined)",

@@ -67,7 +67,8 @@ MISTAKES = {
     f"depth {PAIR} --model huge": "unknown model 'huge'; expected base, small, best or the path of "
     "an .onnx file",
     f"depth {PAIR} --calib calib.txt": f"calib.txt: expected {CALIBRATION}, found no such file",
-    f"depth {PAIR} --write mesh": f"--write: expected all or one of {', '.join(FILES)}, found 'mesh'",
+    f"depth {PAIR} --write mesh": f"--write: expected one of all, {', '.join(FILES)}, found 'mesh'; "
+    "did you mean mesh.ply or mesh.glb?",
     f"measure {PAIR} --from 1 --to 3,4": "--from: expected column and row of a pixel, such as 320,240, found "
     "'1'",
     f"measure {PAIR} --from 1,2 --to 3000,4 --focal-px 500 --baseline-m 0.1": "expected a pixel of the left "

@@ -6,6 +6,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 
 from torch import Tensor
 
+from stereoweave.arguments import suggest
 from stereoweave.errors import FormatError
 from stereoweave.learn.models.densemapnet import DenseMapNet
 from stereoweave.learn.models.dispnet import DispNet
@@ -65,7 +66,10 @@ class CodeNetwork(Protocol):
 def build_network(recipe: Recipe) -> Any:
     """Build a recipe's network with random weights. Raises FormatError if its name is unknown."""
     if recipe.model not in MODELS:
-        raise FormatError(f"{recipe.name}: model = {recipe.model!r}, expected one of {', '.join(MODELS)}")
+        raise FormatError(
+            f"{recipe.name}: model = {recipe.model!r}, expected one of {', '.join(MODELS)}"
+            + suggest(recipe.model, list(MODELS))
+        )
     if recipe.model in _RANGED:
         return MODELS[recipe.model](max_disparity_px=int(recipe.max_disparity_px))
     return MODELS[recipe.model]()

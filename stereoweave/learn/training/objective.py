@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from stereoweave.arguments import suggest
 from stereoweave.bench import metrics
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.learn.data.batches import collate, read_known
@@ -76,7 +77,10 @@ class Objective(Protocol):
 def build_objective(recipe: Recipe, network: nn.Module) -> Objective:
     """Build a recipe's objective. Raises FormatError if the loss is unknown or does not fit the network."""
     if recipe.loss not in LOSSES:
-        raise FormatError(f"{recipe.name}: loss: expected one of {', '.join(LOSSES)}, found {recipe.loss!r}")
+        raise FormatError(
+            f"{recipe.name}: loss: expected one of {', '.join(LOSSES)}, found {recipe.loss!r}"
+            + suggest(recipe.loss, list(LOSSES))
+        )
     if recipe.loss not in (fitting := _list_fitting(network)):
         raise FormatError(
             f"{recipe.name}: loss: expected {' or '.join(fitting)} for model = {recipe.model!r}, "

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from stereoweave.errors import StereoweaveError
+from stereoweave.arguments import check_choice
 from stereoweave.synth.textures import (
     cloth,
     ground,
@@ -127,8 +127,7 @@ class TextureBank:
 
     def layer(self, family: str, variant: int) -> int:
         """Return the index of a texture in `pixels`; `variant` is taken modulo the number of variants."""
-        if family not in FAMILIES:
-            raise StereoweaveError(f"texture: expected one of {', '.join(FAMILIES)}, found {family!r}")
+        check_choice("texture", family, FAMILIES)
         counts = {name: len(each.variants) for name, each in FAMILIES.items()}
         before = list(counts).index(family)
         return sum(list(counts.values())[:before]) + variant % counts[family]
