@@ -152,7 +152,10 @@ def test_results_do_not_move_into_a_folder_that_another_command_writes_to(folder
 
 
 def test_an_unknown_file_is_refused_with_a_list_of_the_known_ones():
-    with pytest.raises(StereoweaveError, match=r"^files: .*disparity.npy.*mesh.glb.*found 'cloud.obj'; did you mean cloud.glb\?$"):
+    with pytest.raises(
+        StereoweaveError,
+        match=r"^files: .*disparity.npy.*mesh.glb.*found 'cloud.obj'; did you mean cloud.glb\?$",
+    ):
         DepthJob(files=("depth.npy", "cloud.obj"))
 
 
