@@ -511,7 +511,9 @@ def test_an_interrupt_ends_the_command_cleanly(tmp_path):
 def test_an_unknown_frame_packing_is_refused_before_anything_is_opened():
     with pytest.raises(StereoweaveError, match=r"^format: expected one of side_by_side, .* found 'beside'"):
         live(["nowhere.mp4"], format="beside")
-    with pytest.raises(StereoweaveError, match=r"for a single source .* found crossed for 0 1"):
+    with pytest.raises(
+        StereoweaveError, match=r"^format: expected a single source with both views, found 0 1; omit"
+    ):
         live(["0", "1"], format="crossed")
 
 
