@@ -317,7 +317,7 @@ def training(
             typer.echo(f"{name}: {score:.5g}")
         return
     for name, law in record_curve(run, out).items():
-        typer.echo(f"{name}: {law.at_10000_pairs:.4g} * (pairs / 10,000)^-{law.exponent:.3f}")
+        typer.echo(f"{name}: {law.at_10000_pairs:.4g} * (pairs / 10,000)^{-law.exponent:.3f}")
 
 
 def _list_makers(

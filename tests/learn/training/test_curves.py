@@ -27,14 +27,14 @@ from stereoweave.learn.training.timed_run import NETWORK_FILE, PROGRESS_FILE, Ru
 
 @pytest.fixture
 def run(tmp_path):
-    """Write a run with batches of 2 and five scores, whose bad-1 falls as the fourth root of the pairs."""
+    """Write a run with batches of 2 and five scores: bad-1 falls with the pairs, the EPE of rooms rises."""
     run = tmp_path / "weave_tiny"
     run.mkdir()
     checkpoint.save(checkpoint_of(untrained()), run / "last.pt")
     for step in (500, 1000, 2000, 4000, 8000):
-        append_scores(
-            run / SCORES_FILE, step, {"epe_px": 2.0, "bad1_percent": 20 * (2 * step / 10_000) ** -0.25}
-        )
+        share = 2 * step / 10_000
+        scores = {"epe_px": 2.0, "bad1_percent": 20 * share**-0.25, "rooms_epe_px": 8 * share**0.1}
+        append_scores(run / SCORES_FILE, step, scores)
     return run
 
 
@@ -74,7 +74,9 @@ def test_a_run_without_scores_is_named(tmp_path):
 
 def test_the_command_prints_the_fits(run, tmp_path, capsys):
     assert main(["bench", "training", str(run), "-o", str(tmp_path / "curve.csv")]) == 0
-    assert "bad1_percent: 20 * (pairs / 10,000)^-0.250" in capsys.readouterr().out
+    printed = capsys.readouterr().out.splitlines()
+    assert "bad1_percent: 20 * (pairs / 10,000)^-0.250" in printed
+    assert "rooms_epe_px: 8 * (pairs / 10,000)^0.100" in printed
 
 
 @pytest.fixture
