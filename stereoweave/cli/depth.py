@@ -233,8 +233,7 @@ def measure(  # noqa: PLR0913 - each is an option of the command line
     sphere = make_sphere_request(projection, look, fov, lens_fov)
     prepared = prepare(pictures, make_request(format, calib, focal_px, baseline_m, rectify, sphere))
     camera = require_camera(prepared.pair)
-    height, width = prepared.pair.left.shape[:2]
-    check_places((width, height), *places)
+    check_places(prepared.pair.left.shape[1::-1], *places)
     matcher = Backend(model=model, threads=threads, provider=provider).matcher()
     estimate = match(matcher, prepared.pair, options)
     error = CameraError(focal=focal_error_percent / 100, baseline=baseline_error_percent / 100)
