@@ -266,7 +266,7 @@ def test_one_frame_is_shown_at_each_time_and_as_each_output(visit, tmp_path):
     visit.page.locator("#video-start input").fill("9")
     visit.page.click("#video-look")
     visit.page.locator("#video-status").get_by_text("found 9 s; choose an earlier one").wait_for()
-    assert not frame.is_visible()
+    frame.wait_for(state="hidden")
     assert visit.refused == []
 
 
@@ -378,7 +378,7 @@ def test_a_3_d_photo_moves_in_the_page_and_is_one_file(answered, tmp_path):
     (frame,) = answered.page.frames[1:]
     frame.wait_for_function("Boolean(window.stereoweaveViewer)")
     assert frame.evaluate("stereoweaveViewer.view.scene.size_px") == [WIDTH, HEIGHT]
-    assert not answered.page.locator("#preview").is_visible()
+    answered.page.locator("#preview").wait_for(state="hidden")
     assert photo.name == "left_viewer.html"
     shown = answered.page.locator("#photo iframe").get_attribute("srcdoc")
     assert shown == photo.read_text(encoding="utf-8")
@@ -462,7 +462,7 @@ def test_a_size_and_a_crop_are_chosen_in_the_page(answered, tmp_path):
     )
     answered.page.get_by_label("Cut off borders").uncheck()
     make_picture(answered, "side_by_side", tmp_path)
-    assert not answered.page.locator("#crop").is_visible()
+    answered.page.locator("#crop").wait_for(state="hidden")
 
 
 def test_five_seconds_of_a_video_are_shown_as_a_preview(visit, tmp_path):
