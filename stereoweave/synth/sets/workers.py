@@ -53,11 +53,14 @@ def run_in_workers(  # noqa: PLR0913 - work, workers, and progress
         try:
             with progress(console) as bar:
                 shown = bar.add_task(description, total=steps, loss="", rate="")
-                pending = {pool.submit(work, task) for task in tasks}
-                while pending:
-                    finished, pending = wait(pending, timeout=0.5, return_when=FIRST_COMPLETED)
+                futures = [pool.submit(work, task) for task in tasks]
+                while futures:
+                    wait(futures, timeout=0.5, return_when=FIRST_COMPLETED)
                     # Read without the lock, because a killed worker may hold it forever.
                     bar.update(shown, completed=done.get_obj().value)
+                    # In the order of the tasks, so that a worker's first error is the one raised.
+                    finished = [future for future in futures if future.done()]
+                    futures = [future for future in futures if future not in finished]
                     yield from (future.result() for future in finished)
         except BaseException as error:
             pool.shutdown(wait=False, cancel_futures=True)
