@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -368,6 +368,15 @@ def pad_to_multiple(image: Float[Tensor, "b c h w"], multiple: int) -> Float[Ten
     if below == behind == 0:
         return image
     return F.pad(image, (0, behind, 0, below), mode="replicate")
+
+
+def predict_any_size(
+    network: Any, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
+) -> tuple[Float[Tensor, "b 1 h w"], ...]:
+    """Return the maps of a network that takes views of certain sizes only, for views of any size."""
+    height, width = left.shape[2:]
+    padded = (pad_to_multiple(view, network.multiple_of) for view in (left, right))
+    return tuple(map_[..., :height, :width] for map_ in network(*padded))
 
 
 class NormReluConv(nn.Sequential):

@@ -10,6 +10,7 @@ from torch import nn
 from stereoweave.bench import metrics
 from stereoweave.bench.error_classes import CLASSES, class_errors, classify
 from stereoweave.learn.data.sources import PairSource
+from stereoweave.learn.models.layers import predict_any_size
 from stereoweave.stereo import Sample
 
 Map = Float[np.ndarray, "h w"]
@@ -18,13 +19,14 @@ Map = Float[np.ndarray, "h w"]
 @torch.no_grad()
 def validate(network: nn.Module, pairs: PairSource, device: torch.device) -> dict[str, float]:
     """Return mean scores over the left views of the pairs, including occluded pixels."""
-    rows, confidences, truths = [], [], []
+    rows, confidences, hits = [], [], []
     for sample, estimate_px, confidence in _predict(network, pairs, device):
         rows.append(_compute_errors(estimate_px, sample.disparity_px))
-        confidences.append(confidence)
-        truths.append(np.abs(estimate_px - sample.disparity_px) <= 1)
+        known = np.isfinite(sample.disparity_px)
+        confidences.append(confidence[known])
+        hits.append(np.abs(estimate_px - sample.disparity_px)[known] <= 1)
     return _average(rows) | {
-        "calibration_error": metrics.calibration_error(np.stack(confidences), np.stack(truths))
+        "calibration_error": metrics.calibration_error(np.concatenate(confidences), np.concatenate(hits))
     }
 
 
@@ -67,7 +69,9 @@ def _predict(
             torch.from_numpy(image).permute(2, 0, 1)[None].to(device).float() / 255
             for image in (sample.left, sample.right)
         )
-        found_px, _, confidence_logit = (x[0, 0].float().cpu() for x in network(left, right))
+        found_px, _, confidence_logit = (
+            x[0, 0].float().cpu() for x in predict_any_size(network, left, right)
+        )
         yield sample, found_px.numpy(), confidence_logit.sigmoid().numpy()
 
 

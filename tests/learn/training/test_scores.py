@@ -1,8 +1,10 @@
 import math
+from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
-from learn_examples import keep_pairs
+from learn_examples import Listed, box_before_a_wall, keep_pairs
 from torch import nn
 
 from stereoweave.bench.error_classes import CLASSES
@@ -10,9 +12,12 @@ from stereoweave.learn.training.scores import validate, validate_by_class
 
 
 class Constant(nn.Module):
-    """A network that returns 5 px everywhere, with a confidence of 3/4."""
+    """A network that returns 5 px everywhere, with a confidence of 3/4, for views of certain sizes."""
+
+    multiple_of = 16
 
     def forward(self, left, right):
+        assert not any(side % 16 for side in left.shape[2:])
         flat = torch.zeros_like(left[:, :1])
         return flat + 5, flat + 5, flat + math.log(3)
 
@@ -29,6 +34,25 @@ def test_scores_are_those_of_the_left_views(tmp_path):
         "calibration_error": 0,  # three quarters are right
     }
     assert scores == pytest.approx(expected, abs=1e-6)
+
+
+def test_pairs_of_different_sizes_are_scored_whatever_the_network_needs():
+    sizes = (33, 70), (48, 96)
+    pairs = Listed([box_before_a_wall(np.random.default_rng(0), size) for size in sizes])
+    expected = [np.mean(np.abs(5 - sample.disparity_px)) for sample in pairs.samples]
+    assert validate(Constant(), pairs, torch.device("cpu"))["epe_px"] == pytest.approx(np.mean(expected))
+
+
+def test_confidence_is_not_scored_where_the_truth_is_unknown():
+    sample = box_before_a_wall(np.random.default_rng(0))
+    # Only the box remains, on which all estimates are wrong.
+    truth_px = np.where(sample.disparity_px == 4, np.float32("nan"), sample.disparity_px)
+    pairs = Listed([replace(sample, disparity_px=truth_px)])
+    assert validate(Constant(), pairs, torch.device("cpu"))["calibration_error"] == pytest.approx(0.75)
+    # Only the wall remains, on which all are right.
+    truth_px = np.where(sample.disparity_px == 4, sample.disparity_px, np.float32("nan"))
+    pairs = Listed([replace(sample, disparity_px=truth_px)])
+    assert validate(Constant(), pairs, torch.device("cpu"))["calibration_error"] == pytest.approx(0.25)
 
 
 def test_the_network_is_scored_as_it_will_be_used(tmp_path):
