@@ -23,8 +23,9 @@ from stereoweave.learn.data.sources import PairSource, cache_pairs, open_sources
 from stereoweave.learn.devices import choose_device
 from stereoweave.learn.mc_cnn_matcher import match_sample
 from stereoweave.learn.models import CodeNetwork
+from stereoweave.learn.models.layers import predict_any_size
 from stereoweave.learn.models.mc_cnn import MCCNN
-from stereoweave.learn.recipe import Recipe
+from stereoweave.learn.recipe import COLLAGE, Recipe
 from stereoweave.learn.training.objective import CodeObjective
 from stereoweave.stereo import Sample
 
@@ -113,10 +114,10 @@ def make_method(trained: Checkpoint) -> DisparityMethod:
         batch = {name: values.to(device) for name, values in collate([sample]).items()}
         # In float32: by default, convolutions on a GPU round to TF32.
         with torch.no_grad(), torch.backends.cudnn.flags(allow_tf32=False):
-            output = network(batch["left"], batch["right"])
+            views = batch["left"], batch["right"]
             if isinstance(network, CodeNetwork):
-                return objective.disparity_px(output, batch)[0, 0].cpu().numpy()
-            return output[0][0, 0].cpu().numpy()
+                return objective.disparity_px(network(*views), batch)[0, 0].cpu().numpy()
+            return predict_any_size(network, *views)[0][0, 0].cpu().numpy()
 
     if isinstance(network, CodeNetwork):
         objective = CodeObjective(trained.recipe, network)
@@ -143,7 +144,11 @@ def _check_names(names: Sequence[str], taken: Sequence[str]) -> None:
 
 
 def _find_common_recipe(networks: dict[str, Checkpoint]) -> Recipe:
-    """Return the first run's recipe. Raises StereoweaveError if another run has different held-out pairs."""
+    """Return the recipe of the first run that predicts depth, else of the first run.
+
+    Raises:
+        StereoweaveError: The runs have different held-out pairs, or different limits of depth.
+    """
     pairs = {name: identify_held_out(one.recipe) for name, one in networks.items()}
     first, *others = pairs
     for name in others:
@@ -152,10 +157,18 @@ def _find_common_recipe(networks: dict[str, Checkpoint]) -> Recipe:
                 f"{name}: expected the held-out pairs of {first}, {pairs[first]}, found {pairs[name]}; "
                 "score this run separately"
             )
-    return networks[first].recipe
+    recipes = [one.recipe for one in networks.values()]
+    limits_m = {limit_m for recipe in recipes if (limit_m := _find_depth_limit(recipe))}
+    if len(limits_m) > 1:
+        raise StereoweaveError(
+            f"runs: expected one max_depth_m, found {' and '.join(map(str, sorted(limits_m)))}; "
+            "score them separately"
+        )
+    return next((recipe for recipe in recipes if _find_depth_limit(recipe)), recipes[0])
 
 
 def identify_held_out(recipe: Recipe) -> tuple[object, ...]:
     """Return the settings that determine a recipe's held-out pairs; equal settings give equal pairs."""
-    places = recipe.dataset, recipe.root, recipe.split, recipe.leave_out
-    return *places, recipe.pair_size, recipe.validation_pairs
+    if recipe.dataset == COLLAGE:
+        return COLLAGE, recipe.pair_size, recipe.validation_pairs
+    return recipe.dataset, recipe.root, recipe.split, recipe.leave_out

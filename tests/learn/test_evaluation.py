@@ -24,7 +24,13 @@ from stereoweave.learn import checkpoint
 from stereoweave.learn.data.batches import collate
 from stereoweave.learn.data.pair_cache import CachedPairs
 from stereoweave.learn.data.sources import VALIDATION_SEED
-from stereoweave.learn.evaluation import evaluate, make_median_method, make_method, score_run
+from stereoweave.learn.evaluation import (
+    evaluate,
+    identify_held_out,
+    make_median_method,
+    make_method,
+    score_run,
+)
 from stereoweave.learn.mc_cnn_matcher import describe
 from stereoweave.learn.models import build_network
 
@@ -175,6 +181,23 @@ def test_runs_with_different_held_out_pairs_are_refused(folder):
     message = complaint(evaluate, [folder / "random", folder / "more"], folder / "pairs", QUIET)
     assert message.startswith("more: expected the held-out pairs of random, (")
     assert message.endswith("; score this run separately")
+
+
+def test_runs_with_different_greatest_depths_are_refused_in_any_order(tmp_path):
+    runs = []
+    for limit_m in (8.0, 10.0):
+        recipe = recipe_of("fast_depth", target="depth", max_depth_m=limit_m)
+        runs.append(tmp_path / f"to_{limit_m:g}_m.pt")
+        checkpoint.save(checkpoint_of(build_network(recipe), recipe), runs[-1])
+    for order in (runs, runs[::-1]):
+        message = complaint(evaluate, order, tmp_path, QUIET)
+        assert message == "runs: expected one max_depth_m, found 8.0 and 10.0; score them separately"
+
+
+def test_held_out_frames_of_a_dataset_are_all_scored_whatever_a_recipe_validates_on():
+    recipe = recipe_of("fast_depth", dataset="sintel", split="random")
+    assert identify_held_out(recipe) == identify_held_out(replace(recipe, validation_pairs=7))
+    assert identify_held_out(recipe) != identify_held_out(replace(recipe, split="scenes"))
 
 
 @pytest.mark.parametrize("other", ["elsewhere/random", "median"])
