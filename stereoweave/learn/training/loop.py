@@ -64,6 +64,11 @@ def _train(recipe: Recipe, out: Path, console: Console) -> Path:
     start = load_start(recipe, last)
     if start.step != fabric.broadcast(start.step):
         raise _folder_not_shared(out)
+    if start.step > recipe.steps:
+        raise StereoweaveError(
+            f"{last}: expected at most {recipe.steps} steps, as the recipe has, found {start.step}; "
+            "give the recipe more steps"
+        )
     if start.step == recipe.steps:
         return last
     run = TrainingRun(recipe, start, fabric)
@@ -119,18 +124,23 @@ def _validate(run: TrainingRun, steps: int, held_out: PairSource, last: Path, co
 def append_scores(path: Path, step: int, scores: dict[str, float]) -> None:
     """Append the scores after `step` steps to a CSV file, replacing the rows of that and later steps."""
     rows = [row for row in read_scores(path) if row["step"] < step] + [{"step": step, **scores}]
+    # Held-out sets may change when a run resumes.
+    columns = dict.fromkeys(name for row in rows for name in row)
     with replacing(path) as temporary, temporary.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[-1]))
+        writer = csv.DictWriter(file, list(columns), restval="")
         writer.writeheader()
         writer.writerows(rows)
 
 
 def read_scores(path: Path) -> list[dict[str, float]]:
-    """Read a run's scores in the order of steps; [] if the file does not exist yet."""
+    """Read a run's scores in the order of steps, without those of sets that a step was not scored on.
+
+    The list is empty if the file does not exist yet.
+    """
     if not path.exists():
         return []
     with path.open(newline="") as file:
-        return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
+        return [{name: float(value) for name, value in row.items() if value} for row in csv.DictReader(file)]
 
 
 @contextmanager

@@ -38,7 +38,7 @@ class TrainingRun(ModelState):
         self.recipe, self.fabric, self.by_class = recipe, fabric, open_held_out_sets(recipe)
         update_average = partial(_update_average, recipe.averaged_steps)
         super().__init__(start, fabric.device, update_average, start.optimiser)
-        self.averaged.n_averaged.fill_(start.step)
+        self.averaged.n_averaged.fill_(start.step - len(start.skipped))
         if self.fabric.world_size > 1 and self.fabric.device.type == "cuda":
             nn.SyncBatchNorm.convert_sync_batchnorm(self.network)  # type: ignore[no-untyped-call]
         torch.set_rng_state(start.random_state)
@@ -84,9 +84,8 @@ class TrainingRun(ModelState):
     ) -> dict[str, float]:
         """Compute the gradient of a step over all ranks. Returns the loss and its terms."""
         for part, values in zip(batches.parts, split_batch(batch, len(batches.parts)), strict=True):
-            if self.recipe.micro_batches > 1:
-                # Seeded per micro-batch, so that dropout does not depend on the number of ranks.
-                torch.manual_seed(int(np.random.SeedSequence(batches.key(step, part)).generate_state(1)[0]))
+            # Seeded per micro-batch, so that dropout depends neither on the number of ranks nor on resuming.
+            torch.manual_seed(int(np.random.SeedSequence(batches.key(step, part)).generate_state(1)[0]))
             losses = self.compute(values)
             sums.add([*losses.values()])
         means = sums.finish(self.fabric, self.recipe.micro_batches)

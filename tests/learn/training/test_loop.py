@@ -297,6 +297,24 @@ def test_a_resumed_run_remembers_the_steps_that_it_skipped(tmp_path, logger):
     )
 
 
+def test_the_average_of_a_resumed_run_does_not_count_skipped_steps(tmp_path, logger):
+    recipe, batches = recipe_of("fast_depth"), Batches(recipe_of("fast_depth"), CAMERA_PAIRS)
+
+    def resume():
+        return TrainingRun(recipe, load_start(recipe, tmp_path / "last.pt"), make_fabric(logger))
+
+    before = resume()
+    hook = before.network.head.to_code.bias.register_hook(lambda gradient: gradient * torch.inf)
+    before.step(0, batches[0], batches)
+    hook.remove()
+    before.step(1, batches[1], batches)
+    before.save(2, {}, tmp_path / "last.pt")
+    resumed = resume()
+    for run in (before, resumed):
+        run.step(2, batches[2], batches)
+    assert_same(resumed.averaged.module.state_dict(), before.averaged.module.state_dict())
+
+
 def test_a_recipe_for_an_unknown_network_is_refused(tmp_path):
     file = write(replace(RECIPE, model="spider"), tmp_path / "spider.toml")
     with pytest.raises(FormatError, match=r"tiny: model = 'spider', expected one of weave_small"):
@@ -392,6 +410,28 @@ def test_scores_written_again_replace_those_of_later_steps(tmp_path):
     rows = training.read_scores(tmp_path / "curve.csv")
     assert rows == [{"step": 10, "loss": 3.0}, {"step": 20, "loss": 2.5}]
     assert training.read_scores(tmp_path / "nowhere.csv") == []
+
+
+def test_a_held_out_set_may_be_left_out_and_return_when_a_run_resumes(tmp_path):
+    rows = [
+        {"step": 10, "loss": 3.0, "rooms": 1.0},
+        {"step": 20, "loss": 2.0},
+        {"step": 30, "loss": 1.0, "rooms": 0.5, "streets": 4.0},
+    ]
+    for row in rows:
+        scores = {name: value for name, value in row.items() if name != "step"}
+        training.append_scores(tmp_path / "curve.csv", row["step"], scores)
+    assert training.read_scores(tmp_path / "curve.csv") == rows
+
+
+def test_a_recipe_with_fewer_steps_than_were_trained_is_refused(folder, finished):
+    message = complaint(
+        training.train_recipe, replace(RECIPE, steps=RECIPE.steps - 1), finished.parent, QUIET
+    )
+    assert message.endswith(
+        f"expected at most {RECIPE.steps - 1} steps, as the recipe has, found {RECIPE.steps}; "
+        "give the recipe more steps"
+    )
 
 
 @pytest.mark.parametrize(("precision", "dtype"), [("bf16-mixed", torch.bfloat16), ("32-true", torch.float32)])
