@@ -83,7 +83,8 @@ class Recipe:
         leave_out: Another key of SPLITS, whose held-out frames are left out first: they are neither trained
             on nor validated on, so that one network can be scored on both splits. Empty for none.
         pairs: Number of collage pairs to cache; every step crops them differently.
-        fresh: Paint a new collage for each draw instead of caching pairs.
+        fresh: Paint a new collage for each draw, of any kind in docs/training-data.md, instead of caching
+            pairs of mixed objects.
         pair_size: Height and width of a collage pair.
         crop_size: Height and width of the crops that a step trains on.
         augment: Also scale, mirror and recolour crops.
@@ -122,8 +123,8 @@ class Recipe:
     batch: Count
     micro_batch: CountOrZero = 0
     learning_rate: Positive
-    warm_up_steps: Whole
-    cool_down_steps: Whole
+    warm_up_steps: CountOrZero
+    cool_down_steps: CountOrZero
     weight_decay: NonNegative = 1e-4
     averaged_steps: Count = 500
     dataset: Text = COLLAGE

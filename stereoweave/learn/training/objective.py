@@ -119,13 +119,18 @@ def _load_teacher(recipe: Recipe, network: WeaveNet) -> Teacher | None:
 
 
 def _refuse_weave_settings(recipe: Recipe) -> None:
-    """Raise FormatError if a recipe of another network has a loss of WeaveNet's alone."""
+    """Raise FormatError if a recipe of another network has a loss or pairs of WeaveNet's alone."""
     for name in ("steadiness", "teacher"):
         if value := getattr(recipe, name):
             raise FormatError(
                 f"{recipe.name}: {name}: expected none for model = {recipe.model!r}, found {value!r}; "
                 "only a WeaveNet has this loss"
             )
+    if recipe.fresh:
+        raise FormatError(
+            f"{recipe.name}: fresh: expected false for model = {recipe.model!r}, found true; some fresh "
+            "collages have disparities below 0, from which only a WeaveNet can learn"
+        )
 
 
 def _list_fitting(network: nn.Module) -> tuple[str, ...]:

@@ -209,6 +209,12 @@ def test_a_disparity_below_0_is_refused():
     assert message.startswith("disparity: expected 0 to 4.0 px, or NaN where unknown, found -0.5")
 
 
+def test_fresh_collages_are_refused_for_networks_that_cannot_learn_negative_disparities():
+    recipe = recipe_of("fast_depth", fresh=True)
+    message = complaint(build_objective, recipe, Constant("code", 0.5))
+    assert message.startswith("tiny: fresh: expected false for model = 'fast_depth', found true; ")
+
+
 def test_depth_without_a_camera_is_refused():
     assert complaint(losses_of, DEPTH, Constant("code", 0.5), batch_of(TRUTH_PX)) == (
         "tiny: target = 'depth': expected pairs with a camera, found dataset = 'collage' without cameras; "
