@@ -137,8 +137,8 @@ def score_flicker(  # noqa: PLR0913 - each is an option of the command line
     for spec in specs:
         for video in _render_videos(spec, frames):
             pairs = [
-                add_noise(pair, np.random.default_rng((seed, number)))
-                for number, pair in enumerate(video.pairs)
+                add_noise(expose(pair, gain), np.random.default_rng((seed, number)))
+                for number, (pair, gain) in enumerate(zip(video.pairs, video.gains, strict=True))
             ]
             estimates = [matcher.estimate(pair.left, pair.right) for pair in pairs]
             for method, result in _run_methods(video, pairs, estimates, threads).items():
@@ -182,8 +182,8 @@ def _render_videos(spec: RenderSpec, frames: int) -> Iterator[RenderedVideo]:
     # The flash is in a frame that is matched where every third one is.
     middle = frames // 2 // MATCHED_EVERY * MATCHED_EVERY
     flash = [_FLASH if frame == middle else 1.0 for frame in range(frames)]
-    yield expose(pan, "flash", flash)
-    yield expose(pan, "fade", np.linspace(1, _FADED, frames).tolist())
+    yield replace(pan, name="flash", gains=flash)
+    yield replace(pan, name="fade", gains=np.linspace(1, _FADED, frames).tolist())
 
 
 def _run_methods(
@@ -222,7 +222,7 @@ def _steady(
 def _render_middle(
     video: RenderedVideo, estimates: list[Estimate], threads: int | None
 ) -> tuple[list[Float[np.ndarray, "h w"]], list[UInt8[np.ndarray, "h w 3"]]]:
-    """Return the left views' disparities, and the middle views rendered from the noise-free video."""
+    """Return the left views' disparities, and the middle views rendered without noise and exposure."""
     renderers = (
         Renderer(pair, estimate, threads=threads)
         for pair, estimate in zip(video.pairs, estimates, strict=True)

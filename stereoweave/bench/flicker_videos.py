@@ -32,7 +32,8 @@ class RenderedVideo:
 
     Attributes:
         name: Name of what happens in the video, such as "passing".
-        pairs: The frames, without noise.
+        pairs: The scene in each frame, without noise and before exposure.
+        gains: Brightness of each frame, as a multiple of the scene's.
         disparities_px: True disparity [H, W] of each frame in the views at LEFT and MIDDLE.
         moving: Mask of the moving object in the left view of each frame.
         change: Function that returns the `Change` from one frame to another, seen from a position.
@@ -40,6 +41,7 @@ class RenderedVideo:
 
     name: str
     pairs: list[StereoPair]
+    gains: Sequence[float]
     disparities_px: list[dict[float, Float[np.ndarray, "h w"]]]
     moving: list[Bool[np.ndarray, "h w"]]
     change: Callable[[int, int, float], Change]
@@ -48,6 +50,15 @@ class RenderedVideo:
         """Return the mask of a frame's points that another frame also shows, seen from the same position."""
         before_px, after_px = (self.disparities_px[number][position] for number in (frame, other))
         return find_seen_again(before_px, after_px, *self.change(frame, other, position))
+
+
+def expose(pair: StereoPair, gain: float) -> StereoPair:
+    """Return the pair with its brightness multiplied by a gain."""
+
+    def brighten(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+        return np.rint(gain * image).clip(0, 255).astype(np.uint8)
+
+    return StereoPair(left=brighten(pair.left), right=brighten(pair.right))
 
 
 def add_noise(pair: StereoPair, rng: np.random.Generator) -> StereoPair:
@@ -81,6 +92,7 @@ def render_panning(spec: RenderSpec, frames: int) -> RenderedVideo:
     return RenderedVideo(
         name="panning",
         pairs=[StereoPair(left=left.image, right=right.image) for left, _, right in renders],
+        gains=[1.0] * frames,
         disparities_px=disparities_px,
         moving=[np.zeros(left.depth_m.shape, bool) for left, _, _ in renders],
         change=change,
@@ -118,7 +130,8 @@ def freeze(video: RenderedVideo) -> RenderedVideo:
     """Return a video of the same length that repeats the first frame."""
     frames = len(video.pairs)
     nothing = np.zeros((*video.moving[0].shape, 3), np.float32)
-    return RenderedVideo(
+    return replace(
+        video,
         name="still",
         pairs=video.pairs[:1] * frames,
         disparities_px=video.disparities_px[:1] * frames,
@@ -166,7 +179,8 @@ def add_passing_oval(
         both = shown[frame][position][1][..., None] * of_oval.astype(np.float32)
         return both[..., :2], both[..., 2]
 
-    return RenderedVideo(
+    return replace(
+        video,
         name=name,
         pairs=[StereoPair(left=views[LEFT][0], right=views[RIGHT][0]) for views in shown],
         disparities_px=[
@@ -179,19 +193,6 @@ def add_passing_oval(
         moving=[views[LEFT][1] for views in shown],
         change=change,
     )
-
-
-def expose(video: RenderedVideo, name: str, gains: Sequence[float]) -> RenderedVideo:
-    """Return the video with each frame's brightness multiplied by a gain."""
-
-    def brighten(image: UInt8[np.ndarray, "h w 3"], gain: float) -> UInt8[np.ndarray, "h w 3"]:
-        return np.rint(gain * image).clip(0, 255).astype(np.uint8)
-
-    pairs = [
-        StereoPair(left=brighten(pair.left, gain), right=brighten(pair.right, gain))
-        for pair, gain in zip(video.pairs, gains, strict=True)
-    ]
-    return replace(video, name=name, pairs=pairs)
 
 
 def _paste_oval(
