@@ -109,7 +109,8 @@ def find_covered(truth_px: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     where the nearest surface is kept.
     """
     width = truth_px.shape[1]
-    target = np.rint(np.arange(width) - truth_px)
+    # Not np.rint, which rounds halves to even: a surface at 0.5 px would cover every second column only.
+    target = np.floor(np.arange(width) - truth_px + 0.5)
     rows, columns = np.nonzero((target >= 0) & (target < width))
     targets = target[rows, columns].astype(np.intp)
     disparity_px = truth_px[rows, columns]

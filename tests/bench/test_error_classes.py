@@ -70,6 +70,12 @@ def test_a_pixel_over_one_px_farther_in_the_same_right_column_is_covered():
     assert not find_covered(np.array([[1.0, 5.0, 0.0, 0.0]])).any()
 
 
+def test_a_surface_at_half_a_pixel_covers_every_column_behind_it():
+    truth_px = np.zeros((1, 40))
+    truth_px[0, 20:30] = 10.5
+    np.testing.assert_array_equal(np.flatnonzero(find_covered(truth_px)), np.arange(10, 20))
+
+
 @pytest.mark.parametrize("unknown", [np.nan, np.inf])
 def test_each_known_pixel_is_in_one_class_and_no_unknown_one_in_any(unknown):
     rng = np.random.default_rng(3)
