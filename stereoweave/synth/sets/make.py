@@ -210,10 +210,11 @@ def _check(spec: RenderSpec, pairs: int, layout: str) -> None:
                 f"and 1 the right one), found {position}",
                 setting="views",
             )
-    names = {f"{position:.2f}" for position in spec.views}
-    if len(names) < len(spec.views):
+    # Files are named by two decimals.
+    rounded = [round(position, 2) for position in spec.views]
+    if rounded != list(spec.views) or len({*rounded}) < len(rounded):
         raise StereoweaveError(
-            f"expected positions that differ when rounded to two decimals, found {spec.views}",
+            f"expected different positions of at most two decimals, found {spec.views}",
             setting="views",
         )
     if layout == "paper" and spec.views:

@@ -344,7 +344,12 @@ def test_a_folder_that_cannot_be_written_is_refused(tmp_path):
             "size_px: expected 32 to 4096 px per side, found 640x0",
         ),
         (1, {"spec": replace(SPEC, size_px=(4097, 32))}, "size_px: expected 32 to 4096 px per side"),
-        (1, {"spec": replace(SPEC, views=(0.5, 0.501))}, "views: expected positions that differ"),
+        (1, {"spec": replace(SPEC, views=(0.5, 0.5))}, "views: expected different positions"),
+        (
+            1,
+            {"spec": replace(SPEC, views=(0.125,))},
+            "views: expected different positions of at most two dec",
+        ),
         (1, {"spec": replace(SPEC, views=(float("nan"),))}, "views: expected positions from -1.0 "),
         (1, {"spec": replace(SPEC, views=(0.5, 2.1))}, "views: expected positions from -1.0 "),
         (1, {"layout": "paper"}, "views: expected no additional views"),
