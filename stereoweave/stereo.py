@@ -5,7 +5,7 @@ x - disparity in the right one; column x of the right image is at x + right disp
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -83,6 +83,21 @@ class StereoCamera:
         check_numbers("depth_m", depth_m)
         with np.errstate(divide="ignore"):
             return self.focal_px * self.baseline_m / depth_m - self.doffs_px
+
+
+def scale_camera(camera: StereoCamera, scale_x: float, scale_y: float) -> StereoCamera:
+    """Return the camera of pictures scaled by these factors.
+
+    The focal length is scaled by `scale_x`, because the horizontal focal length determines depth.
+    """
+    # Pixel centres are integers, so the picture's corner is at -0.5.
+    return replace(
+        camera,
+        focal_px=camera.focal_px * scale_x,
+        cx_px=(camera.cx_px + 0.5) * scale_x - 0.5,
+        cy_px=(camera.cy_px + 0.5) * scale_y - 0.5,
+        doffs_px=camera.doffs_px * scale_x,
+    )
 
 
 def assume_camera(size_px: tuple[int, int], *, doffs_px: float = 0.0) -> StereoCamera:

@@ -1,11 +1,9 @@
 """Scaling of a pair together with its estimate and camera."""
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 
-from stereoweave.stereo import Estimate, StereoCamera, StereoPair
+from stereoweave.stereo import Estimate, StereoPair, scale_camera
 
 
 def fit_size(shape: tuple[int, ...], largest_px: tuple[int, int]) -> tuple[int, int]:
@@ -31,24 +29,13 @@ def scale_down(pair: StereoPair, estimate: Estimate, size_px: tuple[int, int]) -
         cv2.resize(image, size_px, interpolation=cv2.INTER_AREA) for image in (pair.left, pair.right)
     )
     seen = [None if x is None else resize_nearest(x, size_px) for x in (pair.left_seen, pair.right_seen)]
-    camera = None if pair.camera is None else _scale_camera(pair.camera, scale_x, scale_y)
+    camera = None if pair.camera is None else scale_camera(pair.camera, scale_x, scale_y)
     small = StereoPair(left=left, right=right, camera=camera, left_seen=seen[0], right_seen=seen[1])
     return small, Estimate(
         disparity_px=resize_nearest(estimate.disparity_px, size_px) * np.float32(scale_x),
         right_disparity_px=resize_nearest(estimate.right_disparity_px, size_px) * np.float32(scale_x),
         confidence=resize_nearest(estimate.confidence, size_px),
         occluded=resize_nearest(estimate.occluded, size_px),
-    )
-
-
-def _scale_camera(camera: StereoCamera, scale_x: float, scale_y: float) -> StereoCamera:
-    # Pixel centres are integers, so the picture's corner is at -0.5.
-    return replace(
-        camera,
-        focal_px=camera.focal_px * scale_x,
-        cx_px=(camera.cx_px + 0.5) * scale_x - 0.5,
-        cy_px=(camera.cy_px + 0.5) * scale_y - 0.5,
-        doffs_px=camera.doffs_px * scale_x,
     )
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from stereoweave.errors import StereoweaveError
-from stereoweave.stereo import Sample, StereoCamera
+from stereoweave.stereo import Sample, StereoCamera, scale_camera
 
 
 def crop(sample: Sample, height: int, width: int, rng: np.random.Generator) -> Sample:
@@ -108,17 +108,11 @@ def crop_and_scale(
 def crop_camera(
     camera: StereoCamera | None, start_px: int, top_px: int, scale_x: float = 1.0, scale_y: float = 1.0
 ) -> StereoCamera | None:
-    """Return the camera of a crop that starts at the given column and row and is then scaled.
-
-    The focal length is scaled by `scale_x`, because the horizontal focal length determines depth.
-    """
-    return camera and replace(
-        camera,
-        focal_px=camera.focal_px * scale_x,
-        cx_px=(camera.cx_px - start_px) * scale_x,
-        cy_px=(camera.cy_px - top_px) * scale_y,
-        doffs_px=camera.doffs_px * scale_x,
-    )
+    """Return the camera of a crop that starts at the given column and row and is then scaled."""
+    if camera is None:
+        return None
+    cropped = replace(camera, cx_px=camera.cx_px - start_px, cy_px=camera.cy_px - top_px)
+    return scale_camera(cropped, scale_x, scale_y)
 
 
 def mirror(sample: Sample) -> Sample:

@@ -183,7 +183,7 @@ def test_a_crop_larger_than_the_sample_is_refused(sample, size):
 
 def test_the_camera_of_an_enlarged_crop_has_a_longer_focal_length():
     assert crop_camera(CAMERA, 10, 20, 2.0, 0.5) == StereoCamera(
-        focal_px=180.0, baseline_m=0.1, cx_px=120.0, cy_px=10.0, doffs_px=12.0
+        focal_px=180.0, baseline_m=0.1, cx_px=120.5, cy_px=9.75, doffs_px=12.0
     )
     assert crop_camera(None, 10, 20) is None
 
