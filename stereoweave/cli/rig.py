@@ -24,7 +24,7 @@ from stereoweave.cli.options import (
     parse_two_counts,
 )
 from stereoweave.cli.video_check import is_video, print_video_check, refuse_video_options
-from stereoweave.errors import FormatError, Note, StereoweaveError
+from stereoweave.errors import FormatError, Note
 from stereoweave.system.steps import step
 
 Checked = Annotated[
@@ -55,7 +55,7 @@ Timeline = Annotated[
 ]
 
 # The first file marks an earlier result; see `replacing_together`.
-_RECTIFIED = ("left.png", "right.png", "calib.yml")
+_RECTIFIED = ("rectified.json", "left.png", "right.png", "calib.yml")
 
 
 @shows_steps
@@ -131,8 +131,8 @@ def rectify(  # noqa: PLR0913 - each is an option of the command line
         typer.Option(
             "--out",
             "-o",
-            help="Folder to write left.png, right.png and calib.yml to (default: in the current folder, "
-            "named after the left picture, such as left_rectified).",
+            help="Folder to write left.png, right.png, rectified.json and, for a known camera, calib.yml to "
+            "(default: in the current folder, named after the left picture, such as left_rectified).",
         ),
     ] = None,
     format: Format = None,
@@ -144,42 +144,35 @@ def rectify(  # noqa: PLR0913 - each is an option of the command line
 ) -> None:
     """Rectify a pair by its calibration or by matched features.
 
-    Without --calib, features of the pictures are matched. The pictures are cropped to their common area. With
-    --calib, calib.yml is the calibration of the results.
+    Without --calib, features of the pictures are matched. The pictures are cropped to their common area.
+    calib.yml is the calibration of the results, rectified.json names the sources.
     """
     from stereoweave.cameras.calibration_files import write_rig
     from stereoweave.cameras.rectify import crop
     from stereoweave.cameras.rig import format_size, pair_size_px, rectified_rig
+    from stereoweave.io.files import refuse_inputs
     from stereoweave.io.images import write_image
     from stereoweave.io.results_folder import replacing_together
+    from stereoweave.io.run_folder import describe_run
     from stereoweave.pictures.prepare import Request, prepare
 
     out = out or Path(f"{pictures[0].stem}_rectified")
-    _check_output(pictures, calib, out)
+    sources = [*pictures, *([calib] if calib else [])]
+    refuse_inputs((out / name for name in _RECTIFIED), sources)
     make_parent_folder(*(out / name for name in _RECTIFIED))
     sphere = make_sphere_request(projection, look, fov, lens_fov)
     prepared = prepare(pictures, Request(format=format, calibration=calib, rectify=True, sphere=sphere))
     pair = crop(prepared.pair)
-    written = _RECTIFIED if pair.camera else _RECTIFIED[:2]
+    notes = [note.format(running_options()) for note in prepared.notes]
+    written = _RECTIFIED if pair.camera else _RECTIFIED[:-1]
     with replacing_together(out, _RECTIFIED, written) as folder:
+        description = describe_run({"sources": sources, "notes": notes})
+        (folder / "rectified.json").write_text(description, encoding="utf-8")
         write_image(folder / "left.png", pair.left)
         write_image(folder / "right.png", pair.right)
         if pair.camera:
             write_rig(folder / "calib.yml", rectified_rig(pair))
-    notes = [note.format(running_options()) for note in prepared.notes]
     typer.echo("\n".join([f"{out}: left.png and right.png, {format_size(pair_size_px(pair))} px", *notes]))
-
-
-def _check_output(pictures: Sequence[Path], calib: Path | None, out: Path) -> None:
-    """Raise StereoweaveError if a result would replace an input, or lie beside an older calib.yml."""
-    from stereoweave.io.files import refuse_inputs
-
-    refuse_inputs((out / name for name in _RECTIFIED), [*pictures, *([calib] if calib else [])])
-    if calib is None and (out / "calib.yml").exists():
-        raise StereoweaveError(
-            f"{out / 'calib.yml'}: expected no file, because pictures rectified without --calib have no "
-            "calibration, found an older file; choose another --out"
-        )
 
 
 @shows_steps

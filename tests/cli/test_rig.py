@@ -74,7 +74,8 @@ def test_unknown_values_of_a_plain_pair_are_null_in_json(tmp_path, capsys):
 
 def test_a_pair_rectified_by_its_features_passes_the_check(turned, tmp_path, capsys):
     assert main(["rectify", LEFT, turned, "-o", str(tmp_path / "out")]) == 0
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["left.png", "right.png"]
+    names = ["left.png", "rectified.json", "right.png"]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == names
     pair = read_pair(tmp_path / "out" / "left.png", tmp_path / "out" / "right.png")
     assert check_pair(pair.left, pair.right).defects == ()
     assert "rectified: rows are off by" in capsys.readouterr().out
@@ -83,7 +84,9 @@ def test_a_pair_rectified_by_its_features_passes_the_check(turned, tmp_path, cap
 def test_rectified_pictures_are_named_after_the_left_one_by_default(turned, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["rectify", LEFT, turned]) == 0
-    assert sorted(path.name for path in Path("left_rectified").iterdir()) == ["left.png", "right.png"]
+    described = json.loads(Path("left_rectified/rectified.json").read_text())
+    assert described["sources"] == [LEFT, str(turned)]
+    assert described["notes"][0].startswith("rectified: rows are off by")
 
 
 def test_the_new_calibration_fits_the_new_pictures(tmp_path):
@@ -102,11 +105,23 @@ def test_rectification_does_not_overwrite_its_inputs(tmp_path, capsys):
     for words, named in (
         (pictures, "left.png"),
         ([LEFT, RIGHT, "--calib", str(files["calib.yml"])], "calib.yml"),
-        ([LEFT, RIGHT], "calib.yml"),
     ):
         assert main(["rectify", *words, "-o", str(tmp_path)]) == 2
         assert f"{files[named]}: expected" in capsys.readouterr().err
     assert {name: path.read_bytes() for name, path in files.items()} == before
+
+
+def test_rectification_keeps_pictures_of_another_origin_and_replaces_its_own(tmp_path, capsys):
+    theirs = tmp_path / "theirs"
+    theirs.mkdir()
+    (theirs / "right.png").write_bytes(b"a photograph")
+    assert main(["rectify", LEFT, RIGHT, "-o", str(theirs)]) == 2
+    assert f"{theirs / 'right.png'}: expected no file, or one of an earlier" in capsys.readouterr().err
+    assert [path.name for path in theirs.iterdir()] == ["right.png"]
+    calibrated = ["--calib", str(TEXTURED / "calib.txt")]
+    for words, has_calibration in ((calibrated, True), (calibrated, True), ([], False)):
+        assert main(["rectify", LEFT, RIGHT, *words, "-o", str(tmp_path / "out")]) == 0
+        assert (tmp_path / "out" / "calib.yml").exists() == has_calibration
 
 
 def test_a_pair_is_not_rectified_into_a_folder_to_which_another_command_writes(tmp_path, capsys):
