@@ -120,8 +120,8 @@ Preview = Annotated[
     str | None,
     typer.Option(
         metavar="SECONDS",
-        help="Convert only this much from the middle of the video, such as 5s, without sound, and report how "
-        "long the whole video would take.",
+        help="Convert only this much from the middle of the video, such as 5s, without sound, to a file with "
+        "_preview in its name, and report how long the whole video would take.",
     ),
 ]
 VideoModel = Annotated[
@@ -214,6 +214,7 @@ def _convert(
     whole_count = video.frame_count
     if length_s is not None:
         video = _cut_from_middle(video, length_s)
+        out = out.with_stem(f"{out.stem}_preview")  # keeps a converted video
     if job.layout:
         out = _add_mark(out, job.layout, video.size_px)
     with _saying_stopped(out):

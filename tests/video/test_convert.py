@@ -105,7 +105,7 @@ def test_a_spatial_video_is_converted_with_its_times_sound_and_metres(tmp_path, 
 
 def test_the_colours_of_a_spatial_video_are_explained_in_metres(tmp_path):
     assert run(SPATIAL, tmp_path / "out.mp4", "--depth", "--preview", "0.2s") == 0
-    with av.open(str(tmp_path / "out.mp4")) as container:
+    with av.open(str(tmp_path / "out_preview.mp4")) as container:
         comment = container.metadata["comment"]
     low_px, low_m, high_px, high_m = (float(word) for word in re.findall(r"(\d[\d.]*) (?:px|m)\b", comment))
     constant = 160 * 3**0.5 * 0.0635
@@ -346,12 +346,14 @@ def test_a_preview_is_the_middle_of_a_video(tmp_path, capsys):
     video = write_side_by_side(
         tmp_path / "in.mp4", example_pairs(10), times_ms=range(0, 10_000, 1000), codec="libx264", sound=True
     )
+    (tmp_path / "out.mkv").write_bytes(b"an evening's work")
     assert run(video, tmp_path / "out.mkv", "--depth16", "--preview", "3s") == 0
+    assert (tmp_path / "out.mkv").read_bytes() == b"an evening's work"
     told = capsys.readouterr().out.splitlines()
-    assert told[0] == f"{tmp_path / 'out.mkv'}: 3 frames"
+    assert told[0] == f"{tmp_path / 'out_preview.mkv'}: 3 frames"
     assert told[1].startswith("the whole video takes about ")
     # The three seconds begin at 3.5 s, and their first frame is the one at 4 s.
-    with av.open(str(tmp_path / "out.mkv")) as container:
+    with av.open(str(tmp_path / "out_preview.mkv")) as container:
         assert not container.streams.audio
         grey = next(container.decode(video=0)).to_ndarray()
     fifth = list(open_video([video]).frames())[4]

@@ -60,7 +60,7 @@ def test_layouts_without_a_view_for_each_eye_are_not_marked(layout):
 )
 def test_a_layout_of_a_spatial_video_is_marked_with_its_camera(tmp_path, layout, mark, kind):
     assert run(SPATIAL, "-o", tmp_path / "out.mov", "--layout", layout, "--preview", "0.1s") == 0
-    made = tmp_path / f"out{mark}.mov"
+    made = tmp_path / f"out_preview{mark}.mov"
     # Packed, not inverted, both views; 63500 um, no adjustment, 60 degrees.
     assert stereo_3d(made) == [kind, 0, 0, 63500, 0, 1, 60000, 1000]
     video = open_video([made])
@@ -72,7 +72,7 @@ def test_a_layout_of_a_spatial_video_is_marked_with_its_camera(tmp_path, layout,
 def test_views_fitted_to_a_screen_are_marked_without_a_baseline(tmp_path):
     words = "--layout", "side_by_side", "--screen", "television", "--preview", "0.1s"
     assert run(SPATIAL, "-o", tmp_path / "out.mov", *words) == 0
-    assert stereo_3d(tmp_path / "out_LRF_Full_SBS.mov") == [1, 0, 0, 0, 0, 1, 60000, 1000]
+    assert stereo_3d(tmp_path / "out_preview_LRF_Full_SBS.mov") == [1, 0, 0, 0, 0, 1, 60000, 1000]
 
 
 @pytest.mark.parametrize(("baseline_um", "strength"), [(2_000_000_000, 1), (900_000_000, 2)])
@@ -81,7 +81,7 @@ def test_a_baseline_above_a_kilometre_is_left_out(tmp_path, baseline_um, strengt
     (tmp_path / "in.mp4").write_bytes(with_boxes(SPATIAL.read_bytes(), far))
     words = "--layout", "side_by_side", "--strength", strength, "--preview", "0.1s"
     assert run(tmp_path / "in.mp4", "-o", tmp_path / "out.mov", *words) == 0
-    assert stereo_3d(tmp_path / "out_LRF_Full_SBS.mov")[3] == 0
+    assert stereo_3d(tmp_path / "out_preview_LRF_Full_SBS.mov")[3] == 0
 
 
 def test_crossed_views_of_unknown_cameras_are_marked_as_such(tmp_path):
@@ -95,7 +95,7 @@ def test_crossed_views_of_unknown_cameras_are_marked_as_such(tmp_path):
 
 def test_one_view_is_not_marked(tmp_path):
     assert run(SPATIAL, "-o", tmp_path / "out.mp4", "--position", "0.5", "--preview", "0.1s") == 0
-    content = (tmp_path / "out.mp4").read_bytes()
+    content = (tmp_path / "out_preview.mp4").read_bytes()
     assert not any(kind in content for kind in (b"st3d", b"vexu", b"hfov"))
 
 
