@@ -11,8 +11,9 @@ from jaxtyping import Float
 
 from stereoweave.app.capture import Capture, Moment
 from stereoweave.app.screen import Screen
-from stereoweave.cameras.rectify import rectify
+from stereoweave.cameras.rectify import Rectified, rectify
 from stereoweave.cameras.rig import Rig
+from stereoweave.cameras.unit_check import note_units
 from stereoweave.errors import Note
 from stereoweave.io.colormap import colour_disparity, find_colour_range_px
 from stereoweave.matching.estimate import match
@@ -85,7 +86,7 @@ def show(  # noqa: PLR0913 - source, output and settings
         format: Frame packing of a single source, a name in `FRAME_PACKINGS`. Default: detected.
         rig: Calibration with which to rectify the images. Default: the images are already rectified, by the
             camera that a spatial video declares.
-        tell: Function that is called with each note on the sources, at the first frame.
+        tell: Function that is called with each note on the sources and the calibration, at the first frame.
 
     Raises:
         StereoweaveError: A frame packing is given for a spatial video.
@@ -98,13 +99,12 @@ def show(  # noqa: PLR0913 - source, output and settings
     while moment := capture.newest(tally.last):
         if capture.count == 1 and format is None:
             format = detect_layout(capture.name, moment.pictures)
+        split = _split_pair(moment.pictures, format)
+        ready = rectify(split, rig) if rig else Rectified(pair=replace(split, camera=capture.camera))
+        pair = ready.pair
         if not tally.shown:
-            height_px, width_px = moment.pictures[0].shape[:2]
-            odd = PAIR_LAYOUTS[format].note_odd_size(width_px, height_px) if format else []
-            for note in [*capture.notes, *odd]:
+            for note in [*capture.notes, *_note_odd_size(moment, format), *ready.notes, *_note_units(pair)]:
                 tell(note)
-        pair = _split_pair(moment.pictures, format)
-        pair = rectify(pair, rig).pair if rig else replace(pair, camera=capture.camera)
         disparity_px = match(matcher, pair).disparity_px
         range_px = follow_range(range_px, disparity_px)
         tally.add(moment, time.monotonic())
@@ -112,6 +112,15 @@ def show(  # noqa: PLR0913 - source, output and settings
         screen.show(compose(pair, disparity_px, range_px, status))
     if range_px:
         screen.show(compose(pair, disparity_px, range_px, "the end"))
+
+
+def _note_odd_size(moment: Moment, format: str | None) -> list[Note]:
+    height_px, width_px = moment.pictures[0].shape[:2]
+    return PAIR_LAYOUTS[format].note_odd_size(width_px, height_px) if format else []
+
+
+def _note_units(pair: StereoPair) -> list[Note]:
+    return note_units(pair.camera, pair.left.shape[1]) if pair.camera else []
 
 
 def follow_range(

@@ -340,6 +340,19 @@ def test_of_an_odd_width_the_last_column_is_dropped_and_told_once(tmp_path):
     assert list(map(str, told)) == ["the last column is dropped, because the width, 321 px, is odd"]
 
 
+def test_a_baseline_in_a_wrong_unit_is_told_once(tmp_path):
+    calibration = "cam0=[300 0 79.5; 0 300 59.5; 0 0 1]\ncam1=[300 0 79.5; 0 300 59.5; 0 0 1]\n"
+    # 0.1 m in a file that counts in millimetres.
+    (tmp_path / "calib.txt").write_text(f"{calibration}doffs=0\nbaseline=0.1\nwidth=160\nheight=120\n")
+    for number in range(2):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), example_frame()[..., ::-1])
+    told, rig = [], read_rig(tmp_path / "calib.txt")
+    with Screen(0) as screen, Capture([str(tmp_path / "%d.png")]) as capture:
+        show(capture, screen, Matcher(), LiveTally(), format="side_by_side", rig=rig, tell=told.append)
+    (note,) = [str(note) for note in told if "unlikely" in str(note)]
+    assert note.startswith("unlikely depths in metres: the cameras are 0.10 mm apart")
+
+
 def test_after_the_last_frame_the_picture_says_so(tmp_path, monkeypatch):
     said = []
     monkeypatch.setattr(
@@ -357,11 +370,13 @@ def test_two_videos_are_shown_as_the_left_image_and_its_disparity(tmp_path):
     # The calibration of the examples, scaled to half size.
     calibration = "cam0=[300 0 159.5; 0 300 119.5; 0 0 1]\ncam1=[300 0 159.5; 0 300 119.5; 0 0 1]\n"
     (tmp_path / "calib.txt").write_text(f"{calibration}doffs=0\nbaseline=100\nwidth=320\nheight=240\n")
-    tally = LiveTally()
+    tally, told = LiveTally(), []
     with Screen(0) as screen, Capture(sources) as capture:
-        show(capture, screen, Matcher(), tally, rig=read_rig(tmp_path / "calib.txt"))
+        show(capture, screen, Matcher(), tally, rig=read_rig(tmp_path / "calib.txt"), tell=told.append)
         picture = next(read_pictures(request(screen.url, "/stream")))
     assert (tally.shown, tally.last) == (1, 0)
+    (note,) = told
+    assert str(note).endswith("is a calibration of rectified pictures, so they are left unchanged")
     assert picture.shape == (240 + 32 + 40, 640, 3)
     assert np.abs(picture[32:272, :320].astype(int) - left).mean() < 8
     # The top of the example is far and therefore blue; its bottom is near and therefore red.
