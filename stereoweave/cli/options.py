@@ -161,13 +161,6 @@ Provider = Annotated[
     ),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
-Host = Annotated[
-    str,
-    typer.Option(
-        help="Address to listen on: 127.0.0.1 accepts only this computer; 0.0.0.0 accepts any computer that "
-        "can reach it."
-    ),
-]
 Port = Annotated[int, typer.Option(min=0, max=65535, help="Port to listen on; 0 takes any free port.")]
 
 

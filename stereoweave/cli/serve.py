@@ -11,7 +11,6 @@ from typing import Annotated
 import typer
 
 from stereoweave.cli.options import (
-    Host,
     Model,
     Port,
     Provider,
@@ -73,6 +72,15 @@ TokenFile = Annotated[
 ]
 # Syntax of a bearer token in RFC 6750.
 _TOKEN = r"[A-Za-z0-9\-._~+/]+=*"
+
+Host = Annotated[
+    str,
+    typer.Option(
+        "--host",
+        help="Address to listen on: 127.0.0.1 accepts only this computer; an address that other machines can "
+        "reach needs --behind-proxy.",
+    ),
+]
 
 
 def serve(  # noqa: PLR0913 - each is an option of the command line

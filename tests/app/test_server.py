@@ -57,6 +57,14 @@ def test_only_this_computer_is_served(address):
         socket.create_connection(("127.0.0.2", port), timeout=5)
 
 
+def test_an_address_for_other_computers_is_told_and_shown_as_this_computer_reaches_it(tmp_path):
+    server, address = start(tmp_path, "--host", "0.0.0.0", **UNMEASURED)
+    assert address.startswith("http://127.0.0.1:")
+    assert asked(address, Host="name-of-this-computer.example").status == 200
+    expected = "The page has no password and no encryption, and other computers can reach it.\n"
+    assert stop(server) == expected
+
+
 def test_a_port_in_use_is_a_one_line_error(address, capsys):
     port = address.rsplit(":", 1)[1]
     assert main(["app", "--port", port]) == 2
