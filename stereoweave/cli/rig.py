@@ -54,7 +54,7 @@ Timeline = Annotated[
     typer.Option(metavar="PICTURE", help="Picture to write of the video's depth and problems over time."),
 ]
 
-# The first file marks an earlier result; see `replacing_together`.
+# left.png and right.png alone may be the user's own pictures, so the first file marks an earlier result.
 _RECTIFIED = ("rectified.json", "left.png", "right.png", "calib.yml")
 
 
@@ -165,7 +165,7 @@ def rectify(  # noqa: PLR0913 - each is an option of the command line
     pair = crop(prepared.pair)
     notes = [note.format(running_options()) for note in prepared.notes]
     written = _RECTIFIED if pair.camera else _RECTIFIED[:-1]
-    with replacing_together(out, _RECTIFIED, written) as folder:
+    with replacing_together(out, _RECTIFIED, written, marks=_RECTIFIED[:1]) as folder:
         description = describe_run({"sources": sources, "notes": notes})
         (folder / "rectified.json").write_text(description, encoding="utf-8")
         write_image(folder / "left.png", pair.left)

@@ -19,7 +19,7 @@ from stereoweave.cameras.calibration_files import read_calibration_bytes
 from stereoweave.cameras.spherical import SphereRequest
 from stereoweave.errors import NameOf, Note, StereoweaveError, keyword
 from stereoweave.io.colormap import colour_disparity, find_colour_range_px, grey_confidence
-from stereoweave.io.files import reading
+from stereoweave.io.files import reading, refuse_inputs
 from stereoweave.io.images import write_image
 from stereoweave.io.maps import (
     RangeError,
@@ -91,6 +91,8 @@ FILES: dict[str, Callable[[Path, Result], None]] = {
     "report.html": _write_report,
 }
 ALWAYS = ("disparity.pfm", "disparity.png", "preview.png", "confidence.png", "occluded.png", "report.html")
+# By themselves, disparity.pfm and some of the others may be a user's ground truth.
+_MARKS = ("disparity.pfm", "confidence.png", "occluded.png")
 ALL = "all"
 REPORT = "report.html"
 SCALED = "disparity_scaled.png"
@@ -143,14 +145,16 @@ def make_depth(pictures: Sequence[Path], out: Path, job: DepthJob, *, owns_out: 
     """Write all the results for a pair to `out` atomically.
 
     Files in `out` that are not of an earlier result are replaced only with `owns_out`, for a folder that no
-    one else writes to.
+    one else writes to. Otherwise, they are an error, and so is an output that would replace a picture.
     """
     matcher = job.backend.matcher()
     prepared = prepare(pictures, job.request)
     files, left_out = _choose_files(job, prepared)
     if REPORT in files:
         compile_ahead(rehearse_drawing, rehearse_filling)
-    with replacing_together(out, tuple(FILES), () if owns_out else files) as folder:
+    if not owns_out:
+        refuse_inputs((out / file for file in FILES), pictures)
+    with replacing_together(out, tuple(FILES), files, () if owns_out else _MARKS) as folder:
         result = run(prepared, matcher, job.options)
         result = replace(result, command=job.command, name_of=job.name_of)
         notes = [*result.notes, *left_out, *write_files(folder, files, result)]

@@ -142,7 +142,7 @@ def _write(out: Path, found: SphereDepth, facts: SphereFacts) -> None:
     scaled = nearness * 1000 / max(float(nearness.max()), 1e-9)
     range_px = find_colour_range_px(scaled[known][None]) if known.any() else (0.0, 1.0)
     names = (*FILES, LEFT, FACTS)
-    with replacing_together(out, names, names) as folder:
+    with replacing_together(out, names, names, marks=("distance.pfm", FACTS)) as folder:
         write_pfm(folder / "distance.pfm", np.where(known, found.distance, np.inf))
         write_npy(folder / "distance.npy", found.distance)
         write_image(folder / "distance_preview.png", colour_disparity(scaled, range_px) * known[..., None])

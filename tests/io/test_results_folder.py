@@ -6,8 +6,8 @@ from stereoweave.io.results_folder import replacing_together
 NAMES = ("map.pfm", "map.png", "notes.json")
 
 
-def write_result(out, files):
-    with replacing_together(out, NAMES, tuple(files)) as folder:
+def write_result(out, files, marks=NAMES[:2]):
+    with replacing_together(out, NAMES, tuple(files), marks) as folder:
         for name, text in files.items():
             (folder / name).write_text(text)
 
@@ -27,7 +27,10 @@ def test_a_result_replaces_all_files_of_an_earlier_one(tmp_path):
 def test_an_error_leaves_the_folder_as_it_was(tmp_path):
     out = tmp_path / "out"
     write_result(out, {"map.pfm": "1", "map.png": "1"})
-    with pytest.raises(OSError, match="disk full"), replacing_together(out, NAMES, NAMES[:2]) as folder:
+    with (
+        pytest.raises(OSError, match="disk full"),
+        replacing_together(out, NAMES, NAMES[:2], NAMES[:2]) as folder,
+    ):
         (folder / "map.pfm").write_text("2")
         raise OSError("disk full")
     assert read_all(out) == {"map.pfm": "1", "map.png": "1"}
@@ -40,12 +43,19 @@ def test_a_users_own_files_beside_no_earlier_result_are_kept(tmp_path):
     assert read_all(tmp_path) == {"map.pfm": "1", "notes.json": "own"}
 
 
-def test_a_users_own_file_is_not_replaced(tmp_path):
-    (tmp_path / "map.png").write_text("own")
+@pytest.mark.parametrize("name", ["map.pfm", "map.png"])
+def test_a_users_own_file_is_not_replaced(tmp_path, name):
+    (tmp_path / name).write_text("own")
     with pytest.raises(StereoweaveError) as caught:
         write_result(tmp_path, {"map.pfm": "1", "map.png": "1"})
     assert str(caught.value) == (
-        f"{tmp_path / 'map.png'}: expected no file, or one of an earlier result with its map.pfm, found a "
-        "file of another origin; choose another folder (out)"
+        f"{tmp_path / name}: expected no file, or one of an earlier result, found a file of another origin; "
+        "choose another folder (out)"
     )
-    assert read_all(tmp_path) == {"map.png": "own"}
+    assert read_all(tmp_path) == {name: "own"}
+
+
+def test_in_a_folder_of_results_alone_all_their_files_are_replaced(tmp_path):
+    (tmp_path / "map.png").write_text("1")
+    write_result(tmp_path, {"map.pfm": "2"}, marks=())
+    assert read_all(tmp_path) == {"map.pfm": "2"}

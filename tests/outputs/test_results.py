@@ -143,6 +143,20 @@ def test_files_with_the_same_names_that_are_not_an_earlier_result_stay(folder):
     assert {Path(name).read_text() for name in ("mesh.ply", "depth.npy")} == {"of another program"}
 
 
+def test_ground_truth_and_inputs_are_not_replaced(folder):
+    Path("truth").mkdir()
+    for name in ("disparity.pfm", "mesh.ply"):
+        Path("truth", name).write_text("of another program")
+    with pytest.raises(StereoweaveError, match="^truth/disparity.pfm: .* found a file of another origin"):
+        make_depth(PICTURES, Path("truth"), PLAIN)
+    assert names_in("truth") == {"disparity.pfm", "mesh.ply"}
+    make_depth(PICTURES, Path("out"), replace(PLAIN, files=("matched_left.png",)))
+    again = [Path("out/matched_left.png"), PICTURES[1]]
+    with pytest.raises(StereoweaveError, match="^out/matched_left.png: .* found one of the inputs"):
+        make_depth(again, Path("out"), PLAIN)
+    assert Path("out/matched_left.png").exists()
+
+
 def test_results_do_not_move_into_a_folder_that_another_command_writes_to(folder):
     make_depth(PICTURES, Path("out"), PLAIN)
     before = {file: file.read_bytes() for file in Path("out").iterdir()}
