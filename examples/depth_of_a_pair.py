@@ -1,4 +1,4 @@
-"""Depth in metres of a rectified pair: prints it for the middle, and writes depth.png and disparity.png.
+"""Depth in metres of a calibrated pair: prints it for the middle, and writes depth.png and disparity.png.
 
 Run: python examples/depth_of_a_pair.py
 """
@@ -6,16 +6,15 @@ Run: python examples/depth_of_a_pair.py
 from pathlib import Path
 
 import stereoweave as sw
-from stereoweave.cameras.calibration_files import read_rig
 from stereoweave.io.colormap import colour_disparity, find_colour_range_px
 from stereoweave.io.images import write_image
 from stereoweave.io.maps import write_depth_png
 
 HERE = Path(__file__).parent
 
-estimate = sw.estimate(HERE / "left.png", HERE / "right.png")
-camera = read_rig(HERE / "calib.txt").camera()
-depth_m = camera.depth_m(estimate.disparity_px)
+estimate = sw.estimate(HERE / "left.png", HERE / "right.png", calibration=HERE / "calib.txt")
+assert estimate.pair and estimate.pair.camera
+depth_m = estimate.pair.camera.depth_m(estimate.disparity_px)
 
 height, width = depth_m.shape
 print(f"in the middle: {depth_m[height // 2, width // 2]:.2f} m")

@@ -101,6 +101,14 @@ def calls() -> list[Call]:
     return [
         Call("estimate", sw.estimate, **pair, **how, **steps, range_px=(0, 20), align="auto"),
         Call(
+            "estimate with a calibration",
+            sw.estimate,
+            left=TEXTURED / "left.png",
+            right=TEXTURED / "right.png",
+            calibration=TEXTURED / "calib.txt",
+        ),
+        Call("estimate of one file", sw.estimate, left=TEXTURED / "left.png", format="side_by_side"),
+        Call(
             "estimate of a window",
             sw.estimate,
             left=HALF_SPHERE,

@@ -1,6 +1,7 @@
 """From two pictures to an estimate in one call: `stereoweave.estimate`."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from inspect import signature
 from pathlib import Path
@@ -8,8 +9,12 @@ from typing import Literal
 
 from stereoweave.arguments import as_two_numbers, check_kind, check_number, describe
 from stereoweave.cameras import auto_align
+from stereoweave.cameras.calibration_files import read_rig
 from stereoweave.cameras.diagnosis import find_problems
+from stereoweave.cameras.rectify import Rectified, rectify
+from stereoweave.cameras.rig import pair_size_px
 from stereoweave.cameras.spherical import SphereRequest
+from stereoweave.cameras.unit_check import note_units
 from stereoweave.errors import Note, Remedy, StereoweaveError
 from stereoweave.io.arrays import ImageLike, as_rgb
 from stereoweave.matching.backend import Backend
@@ -17,7 +22,7 @@ from stereoweave.matching.estimate import match
 from stereoweave.matching.options import MatchOptions
 from stereoweave.matching.providers import CPU
 from stereoweave.pictures.panoramas import SphereView, cut_pair
-from stereoweave.pictures.prepare import Prepared, Request, prepare
+from stereoweave.pictures.prepare import Request, prepare
 from stereoweave.stereo import Estimate, StereoPair
 
 _RECTIFY_FIRST = Remedy("give pictures that are rectified by a calibration")
@@ -34,6 +39,8 @@ def estimate(  # noqa: PLR0913 - all but the images are keyword-only and optiona
     raw: bool = False,
     range_px: tuple[float, float] | None = None,
     align: Literal["auto"] | None = None,
+    calibration: str | Path | None = None,
+    format: str | None = None,
     projection: str | None = None,
     look_deg: tuple[float, float] | None = None,
     fov_deg: float | None = None,
@@ -58,6 +65,9 @@ def estimate(  # noqa: PLR0913 - all but the images are keyword-only and optiona
             pair is aligned first (`auto_align.align`). The estimate then belongs to the aligned pair, which
             it holds as `pair`, with `notes` on what was changed and on problems that remain, such as two
             pictures of different scenes. Default: the images must be rectified, and are not checked.
+        calibration: File with the calibration of both cameras (`read_rig`). The pair is rectified by it if
+            the cameras are not parallel. The estimate holds the pair with its camera, and `notes`.
+        format: Layout of one file with both views, such as side_by_side. Default: detected.
         projection: Projection of a VR180 or 360-degree file or pair: equirectangular, half_equirectangular,
             fisheye or rectilinear. The estimate then belongs to a window of it, and holds the window's pair.
             Default: detected if `left` is the path of one file, else rectilinear.
@@ -69,32 +79,59 @@ def estimate(  # noqa: PLR0913 - all but the images are keyword-only and optiona
         ValueError: MatcherError for an unknown model or an unavailable provider, ProviderError for a provider
             that fails, and StereoweaveError for invalid images or options.
     """
-    if align is not None and not (isinstance(align, str) and align == "auto"):
-        raise StereoweaveError(f"expected 'auto' or None, got {describe(align)}", setting="align")
-    options = MatchOptions(range_px=range_px, refined=refined, raw=raw)
-    backend = Backend(model=model, threads=threads, provider=provider)
-    sphere = _request_window(projection, look_deg, fov_deg, lens_fov_deg)
-    if right is None:
-        prepared = _open_both(left, sphere, aligned=bool(align))
-        found = match(backend.matcher(), prepared.pair, options)
-        notes = (*_fit_to_python(prepared.notes), *found.notes)
-        if align:
-            notes += tuple(find_problems(prepared.pair, found, prepared.alignment, _RECTIFY_FIRST))
-        return replace(found, pair=prepared.pair, notes=notes)
-    given = StereoPair(left=as_rgb(left, "left"), right=as_rgb(right, "right"))
-    return _match_images(given, backend, options, sphere, aligned=bool(align))
+    with _keeping_own_remedies():
+        _check_alignment(align, calibration)
+        options = MatchOptions(range_px=range_px, refined=refined, raw=raw)
+        backend = Backend(model=model, threads=threads, provider=provider)
+        request = Request(
+            format=format,
+            calibration=None if calibration is None else Path(calibration),
+            rectify=None if align else calibration is not None,
+            sphere=_request_window(projection, look_deg, fov_deg, lens_fov_deg),
+        )
+        if right is None:
+            return _match_one_file(left, backend, options, request)
+        if format is not None:
+            raise StereoweaveError("expected none for two images, found one", setting="format")
+        given = StereoPair(left=as_rgb(left, "left"), right=as_rgb(right, "right"))
+        return _match_images(given, backend, options, request)
 
 
-def _match_images(
-    given: StereoPair, backend: Backend, options: MatchOptions, sphere: SphereRequest, *, aligned: bool
-) -> Estimate:
-    """Match two images, or a window of them; align them first if asked for."""
+def _match_one_file(file: ImageLike, backend: Backend, options: MatchOptions, request: Request) -> Estimate:
+    """Match the pair in one file with both views."""
+    if not isinstance(file, str | Path):
+        raise StereoweaveError(
+            f"expected a right image besides a left one that is no path, found {describe(None)}",
+            setting="right",
+            remedy=Remedy("give it, or the path of one file with both views"),
+        )
+    prepared = prepare([Path(file)], request)
+    found = match(backend.matcher(), prepared.pair, options)
+    notes = (*_fit_to_python(prepared.notes), *found.notes)
+    if request.rectify is None:
+        notes += tuple(find_problems(prepared.pair, found, prepared.alignment, _RECTIFY_FIRST))
+    elif request.calibration:
+        notes += _note_units(prepared.pair)
+    return replace(found, pair=prepared.pair, notes=notes)
+
+
+def _match_images(given: StereoPair, backend: Backend, options: MatchOptions, request: Request) -> Estimate:
+    """Match two images, or a window of them; rectify or align them first if asked for."""
     matcher = backend.matcher()
-    chosen = sphere.choose("two images", None)
+    chosen = request.sphere.choose("two images", None)
+    if request.calibration:
+        if chosen:
+            raise StereoweaveError(
+                "expected no calibration, which follows from the projection", setting="calibration"
+            )
+        rectified = _rectify(given, request.calibration)
+        found = match(matcher, rectified.pair, options)
+        notes = (*_fit_to_python(rectified.notes), *found.notes, *_note_units(rectified.pair))
+        return replace(found, pair=rectified.pair, notes=notes)
     if chosen:
         eye_size_px = given.left.shape[1], given.left.shape[0]
-        given = cut_pair(given, SphereView.chosen(chosen, eye_size_px, sphere))
-    if not aligned:
+        given = cut_pair(given, SphereView.chosen(chosen, eye_size_px, request.sphere))
+    if request.rectify is False:
         found = match(matcher, given, options)
         return replace(found, pair=given) if chosen else found
     ready = auto_align.align(given)
@@ -118,21 +155,42 @@ def _request_window(
     return SphereRequest(projection=projection, look_deg=look, fov_deg=fov_deg, lens_fov_deg=lens_fov_deg)
 
 
-def _open_both(file: ImageLike, sphere: SphereRequest, *, aligned: bool) -> Prepared:
-    """Open the pair in one file with both views."""
-    if not isinstance(file, str | Path):
-        raise StereoweaveError(
-            f"expected a right image besides a left one that is no path, found {describe(None)}",
-            setting="right",
-            remedy=Remedy("give it, or the path of one file with both views"),
-        )
-    return prepare([Path(file)], Request(rectify=None if aligned else False, sphere=sphere))
+def _check_alignment(align: object, calibration: object) -> None:
+    if align is not None and not (isinstance(align, str) and align == "auto"):
+        raise StereoweaveError(f"expected 'auto' or None, got {describe(align)}", setting="align")
+    if calibration is not None:
+        check_kind("calibration", calibration, str, Path)
+        if align:
+            raise StereoweaveError(
+                f"expected either a calibration or align='auto', found both, {calibration}",
+                setting="calibration",
+            )
+
+
+def _rectify(pair: StereoPair, calibration: Path) -> Rectified:
+    return rectify(pair, read_rig(calibration, pair_size_px(pair)))
+
+
+def _note_units(pair: StereoPair) -> tuple[Note, ...]:
+    return tuple(note_units(pair.camera, pair.left.shape[1])) if pair.camera else ()
+
+
+def _is_own(remedy: Remedy | None) -> bool:
+    """Return whether a remedy names only settings that `estimate` has."""
+    return remedy is None or {*signature(estimate).parameters}.issuperset(remedy.settings)
 
 
 def _fit_to_python(notes: Iterable[Note]) -> tuple[Note, ...]:
     """Return notes without the remedies that name settings which `estimate` does not have."""
-    own = set(signature(estimate).parameters)
-    return tuple(
-        replace(note, remedy=None) if note.remedy and not own.issuperset(note.remedy.settings) else note
-        for note in notes
-    )
+    return tuple(note if _is_own(note.remedy) else replace(note, remedy=None) for note in notes)
+
+
+@contextmanager
+def _keeping_own_remedies() -> Iterator[None]:
+    """Remove from an error a remedy that names settings which `estimate` does not have."""
+    try:
+        yield
+    except StereoweaveError as error:
+        if not _is_own(error.remedy):
+            error.remedy = None
+        raise

@@ -2,10 +2,13 @@
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 import stereoweave as sw
+from stereoweave.cameras.calibration_files import read_rig, write_rig
+from stereoweave.cameras.rig import Optics, Rig
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.images import read_pair, write_image
 from stereoweave.learn.data.collage import paint_collage
@@ -78,14 +81,14 @@ def test_the_estimate_says_which_problems_remain(example):
     assert sw.estimate(example.left, example.left).notes == ()
 
 
-def test_a_note_advises_nothing_that_the_function_cannot_do(example):
+def test_a_note_advises_what_the_function_can_do(example):
     # Only a small window has texture, with fewer matches than rectification needs.
     left, right = np.full((2, *example.left.shape), 90, np.uint8)
     left[200:290, 200:290] = example.left[200:290, 200:290]
     right[200 - DOWN_PX : 290 - DOWN_PX, 180:270] = example.right[200:290, 180:270]
     failed, _ = map(str, sw.estimate(left, right, align="auto").notes)
     assert failed.startswith("the pair could not be rectified: expected at least 40 feature matches")
-    assert failed.endswith("photograph a scene with more texture and with more overlap")
+    assert failed.endswith("with more texture and with more overlap; or give a calibration (calibration)")
 
 
 @pytest.mark.usefixtures("without_shape_checks")
@@ -114,6 +117,61 @@ def test_a_sound_pair_gives_the_same_with_and_without_alignment(example, estimat
 def test_another_kind_of_alignment_is_refused(example):
     with pytest.raises(StereoweaveError, match="^align: expected 'auto' or None, got 'always'"):
         sw.estimate(example.left, example.right, align="always")
+
+
+def write_rolled_rig(path, roll_degrees):
+    """Write a calibration for 160x120 px: 0.1 m apart, the right camera rolled about its optical axis."""
+    lens = Optics(matrix=np.array([[150.0, 0, 79.5], [0, 150, 59.5], [0, 0, 1]]), distortion=np.zeros(5))
+    rotation = cv2.Rodrigues(np.array([0, 0, np.radians(roll_degrees)]))[0]
+    towards_left_m = rotation @ np.array([-0.1, 0, 0])
+    rig = Rig(left=lens, right=lens, rotation=rotation, translation_m=towards_left_m, size_px=(160, 120))
+    write_rig(path, rig)
+
+
+def test_a_calibration_gives_the_pair_its_camera(example, estimate):
+    found = sw.estimate(example.left, example.right, calibration=EXAMPLES / "calib.txt")
+    assert found.pair.camera == read_rig(EXAMPLES / "calib.txt").camera()
+    np.testing.assert_array_equal(found.disparity_px, estimate.disparity_px)
+    assert str(found.notes[-1]).endswith("calibration of rectified pictures, so they are left unchanged")
+
+
+def test_a_pair_is_rectified_by_a_calibration_of_cameras_that_are_not_parallel(tmp_path):
+    write_rolled_rig(tmp_path / "rig.yml", roll_degrees=2.0)
+    grey = np.full((120, 160, 3), 128, np.uint8)
+    found = sw.estimate(grey, grey, calibration=str(tmp_path / "rig.yml"))
+    assert found.pair.right_seen is not None and not found.pair.right_seen.all()
+    assert (found.confidence[~found.pair.left_seen] == 0).all()
+    assert (found.pair.camera.focal_px, found.pair.camera.baseline_m) == pytest.approx((150, 0.1))
+    assert any("rectified with" in str(note) for note in found.notes)
+
+
+def test_a_calibration_for_another_size_or_besides_an_alignment_is_refused(example):
+    half = example.left[::2, ::2], example.right[::2, ::2]
+    with pytest.raises(StereoweaveError, match="calib.txt: .* 320x240"):
+        sw.estimate(*half, calibration=EXAMPLES / "calib.txt")
+    with pytest.raises(StereoweaveError, match="^calibration: expected either a calibration or align='auto'"):
+        sw.estimate(example.left, example.right, calibration=EXAMPLES / "calib.txt", align="auto")
+    with pytest.raises(StereoweaveError, match="^calibration: expected no calibration, which follows from"):
+        sw.estimate(
+            example.left, example.right, calibration=EXAMPLES / "calib.txt", projection="equirectangular"
+        )
+
+
+def test_the_layout_of_one_file_is_chosen_and_named_in_the_error_that_asks_for_it(example, tmp_path):
+    write_image(tmp_path / "both.png", np.vstack([example.left, example.right]))
+    chosen = sw.estimate(tmp_path / "both.png", format="top_bottom")
+    np.testing.assert_array_equal(chosen.pair.right, example.right)
+    with pytest.raises(StereoweaveError, match=r"choose its layout, such as side_by_side \(format\)$"):
+        sw.estimate(EXAMPLES / "left.png")
+    with pytest.raises(StereoweaveError, match="^format: expected none for two images"):
+        sw.estimate(example.left, example.right, format="side_by_side")
+
+
+def test_an_error_advises_nothing_that_the_function_cannot_do(tmp_path):
+    (tmp_path / "film.mp4").write_bytes(b"\0\0\0\x18ftypisom\0\0\0\0isom" + bytes(200))
+    with pytest.raises(StereoweaveError) as caught:
+        sw.estimate(tmp_path / "film.mp4")
+    assert "found a video" in str(caught.value) and "(video)" not in str(caught.value)
 
 
 def test_one_file_with_both_views_is_a_pair(example, estimate, tmp_path):
