@@ -9,6 +9,7 @@ from PIL import Image
 
 from stereoweave.arguments import is_plain_array
 from stereoweave.errors import StereoweaveError
+from stereoweave.io.decoding import LEAST_OF_SIXTEEN_BITS
 from stereoweave.io.images import read_image
 
 _CHANNELS = (1, 3, 4)
@@ -32,9 +33,10 @@ ImageLike = str | Path | Image.Image | np.ndarray | Tensor
 def as_rgb(image: ImageLike, name: str = "image") -> UInt8[np.ndarray, "h w 3"]:
     """Convert an image to contiguous uint8 RGB [H, W, 3]; an array already in this form is not copied.
 
-    Grey is repeated in all three channels, alpha is dropped, 16-bit values are reduced to their upper 8 bits,
-    and floats in 0..1 are scaled and rounded. The channels are the last axis if its length is 1, 3 or 4, else
-    the first axis, so [3, W, 3] means 3 rows of W pixels. A batch of one image loses its leading axis.
+    Grey is repeated in all three channels, and alpha is dropped. Values of uint16, which must use all 16
+    bits, are reduced to their upper 8 bits; floats in 0..1 are scaled and rounded. The channels are the
+    last axis if its length is 1, 3 or 4, else the first axis, so [3, W, 3] means 3 rows of W pixels. A
+    batch of one image loses its leading axis.
     A path is read by `read_image`.
 
     Channels are taken to be RGB: reverse OpenCV's BGR images with `image[..., ::-1]` first. The EXIF
@@ -45,8 +47,8 @@ def as_rgb(image: ImageLike, name: str = "image") -> UInt8[np.ndarray, "h w 3"]:
         name: Name of the image in error messages.
 
     Raises:
-        StereoweaveError: The type, shape or dtype is unsupported, or a float is outside 0..1; FormatError for
-            a picture that cannot be read.
+        StereoweaveError: The type, shape or dtype is unsupported, a float is outside 0..1, or values of
+            uint16 are below 4096; FormatError for a picture that cannot be read.
     """
     if isinstance(image, str | Path):
         return read_image(image)
@@ -94,9 +96,14 @@ def _convert_pil(picture: Image.Image) -> Shaped[np.ndarray, "h w *channels"]:
 def _to_eight_bits(values: Shaped[np.ndarray, "..."], name: str) -> UInt8[np.ndarray, "..."]:
     if values.dtype == np.uint8:
         return values
-    if values.dtype.kind == "u" and values.dtype.itemsize == 2:
-        return (values >> 8).astype(np.uint8)
     got = f"{values.dtype} {list(values.shape)}"
+    if values.dtype.kind == "u" and values.dtype.itemsize == 2:
+        if values.size and 0 < values.max() < LEAST_OF_SIXTEEN_BITS:
+            raise StereoweaveError(
+                f"{name}: expected uint16 values that use 0..65535, got {got} up to {values.max()}, which is "
+                "nearly black; multiply values of 12 bits by 16, of 10 bits by 64"
+            )
+        return (values >> 8).astype(np.uint8)
     if values.dtype.kind != "f":
         raise StereoweaveError(
             f"{name}: expected uint8, uint16 or floats in 0..1, got {got}; "

@@ -40,6 +40,9 @@ _VIDEO_ENDINGS = (".mp4", ".mov", ".mkv", ".mk3d", ".avi", ".webm", ".m4v", ".wm
 _AVIF_BRANDS = {b"avif", b"avis"}
 _MP_ENTRIES, _DISPARITY = 0xB002, "Multi-Frame Image: (Disparity)"
 _LONGEST_WORDS = 100
+_BITS_PER_SAMPLE = 258  # a TIFF tag
+# Values of 16 bits that are all below it are probably of a camera of 12 bits or fewer.
+LEAST_OF_SIXTEEN_BITS = 4096
 # Modes to which pictures are converted before their ICC profiles are applied, by the pictures' own modes.
 _PROFILED = {"RGB": "RGB", "RGBA": "RGB", "P": "RGB", "L": "L", "LA": "L", "CMYK": "CMYK"}
 
@@ -48,7 +51,7 @@ logging.getLogger("PIL").addHandler(logging.NullHandler())
 
 
 class DecodedPicture(NamedTuple):
-    """A decoded picture in sRGB, not yet turned upright, with its metadata tags and a note on its colours."""
+    """A decoded picture in sRGB, not yet turned upright, with its metadata tags and a note on its values."""
 
     image: Image.Image
     tags: exif.Tags
@@ -113,7 +116,8 @@ def decode(path: str | Path, picture: Image.Image) -> DecodedPicture:
         _check_decoded(path, stated_px, picture.size)
     tags = exif.read_tags(picture)
     if picture.mode.startswith(("I", "F")):
-        return DecodedPicture(_to_eight_bits(path, picture), tags, None)
+        grey, note = _to_eight_bits(path, picture)
+        return DecodedPicture(grey, tags, note)
     image, note = _convert_to_srgb(picture)
     with _decoding(path):
         return DecodedPicture(image if image.mode == "RGB" else image.convert("RGB"), tags, note)
@@ -318,8 +322,11 @@ def _count_frames(path: Path, picture: Any) -> int:
         return int(picture.n_frames)
 
 
-def _to_eight_bits(path: str | Path, picture: Image.Image) -> Image.Image:
-    """Convert a loaded 16-bit grey picture, or a 32-bit one with 16-bit values, to 8-bit RGB."""
+def _to_eight_bits(path: str | Path, picture: Image.Image) -> tuple[Image.Image, str | None]:
+    """Convert a loaded 16-bit grey picture, or a 32-bit one with 16-bit values, to 8-bit RGB.
+
+    Returns it, with a note if its values seem to have fewer bits than the file says.
+    """
     with _decoding(path):
         values = np.asarray(picture)
     if picture.mode == "F" or values.min() < 0 or values.max() > 65535:
@@ -327,9 +334,20 @@ def _to_eight_bits(path: str | Path, picture: Image.Image) -> Image.Image:
             f"{path}: expected {A_PICTURE}, found one with more than 16 bits per channel or with negative "
             f"values (mode {picture.mode}), which cannot be read"
         )
-    # Keep the upper byte, as Pillow does for 16-bit colour; a 32-bit file may hold 8-bit values.
-    bits = 8 if picture.mode != "I" or values.max() > 255 else 0
-    return Image.fromarray((values >> bits).astype(np.uint8)).convert("RGB")
+    bits = _count_bits(picture, values)
+    note = None
+    if bits == 16 and 0 < values.max() < LEAST_OF_SIXTEEN_BITS:
+        note = f"nearly black: 16 bits with values up to {values.max()}; multiply values of 12 bits by 16"
+    # Keep the upper byte, as Pillow does for 16-bit colour.
+    return Image.fromarray((values >> (bits - 8)).astype(np.uint8)).convert("RGB"), note
+
+
+def _count_bits(picture: Any, values: np.ndarray) -> int:
+    """Return the number of bits of a grey picture's values: a 32-bit file may hold 8, a TIFF states 12."""
+    if picture.mode == "I" and values.max() <= 255:
+        return 8
+    stated = picture.tag_v2.get(_BITS_PER_SAMPLE, (16,))[0] if picture.format == "TIFF" else 16
+    return stated if 8 < stated < 16 else 16
 
 
 def _convert_to_srgb(picture: Image.Image) -> tuple[Image.Image, str | None]:

@@ -1,3 +1,4 @@
+import struct
 from pathlib import Path
 
 import cv2
@@ -8,6 +9,7 @@ from PIL import Image
 
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io import images
+from stereoweave.io.decoding import read_picture
 
 
 @pytest.fixture
@@ -71,9 +73,27 @@ def test_32_bit_grey_is_read_as_the_8_or_16_bits_that_it_holds(tmp_path, scale, 
     np.testing.assert_array_equal(images.read_image(tmp_path / "grey.tiff")[..., 1], values >> shift)
 
 
-def test_dark_grey_of_16_bits_stays_dark(tmp_path):
-    cv2.imwrite(str(tmp_path / "grey.png"), np.full((40, 48), 200, np.uint16))
-    assert images.read_image(tmp_path / "grey.png").max() == 0
+def test_dark_grey_of_16_bits_stays_dark_with_a_note(tmp_path):
+    cv2.imwrite(str(tmp_path / "grey.png"), np.full((40, 48), 2600, np.uint16))
+    decoded = read_picture(tmp_path / "grey.png")
+    assert np.unique(decoded.image) == [10]
+    assert decoded.note.startswith("nearly black: 16 bits with values up to 2600; multiply")
+    cv2.imwrite(str(tmp_path / "black.png"), np.zeros((40, 48), np.uint16))
+    assert read_picture(tmp_path / "black.png").note is None
+
+
+def test_a_tiff_of_12_bits_keeps_the_upper_8(tmp_path):
+    # Each row has the values 0x123 and 0xFFF in turn, two of which are three bytes.
+    tags = {256: 48, 257: 40, 258: 12, 259: 1, 262: 1, 273: 122, 277: 1, 278: 40, 279: 40 * 72}
+    entries = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in tags.items())
+    directory = struct.pack("<H", len(tags)) + entries + bytes(4)
+    header = struct.pack("<2sHI", b"II", 42, 8)
+    content = header + directory
+    assert len(content) == 122
+    (tmp_path / "grey.tif").write_bytes(content + bytes.fromhex("123fff") * 24 * 40)
+    decoded = read_picture(tmp_path / "grey.tif")
+    np.testing.assert_array_equal(np.asarray(decoded.image)[0, :2, 0], [0x12, 0xFF])
+    assert decoded.note is None
 
 
 @pytest.mark.parametrize("level", [-1, 65536])
