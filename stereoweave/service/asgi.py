@@ -161,6 +161,19 @@ def make_app(
     return app
 
 
+# What is expected of a form's field, by the type of Pydantic's error.
+_EXPECTED = {
+    "literal_error": "{expected}",
+    "greater_than": "a number above {gt:g}",
+    "greater_than_equal": "a number of at least {ge:g}",
+    "less_than_equal": "a number of at most {le:g}",
+    "finite_number": "a finite number",
+    "float_parsing": "a number",
+    "bool_parsing": "true or false",
+}
+_LONGEST_FOUND = 40
+
+
 async def _refuse(_: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)
     return JSONResponse({"detail": _join_errors(error)}, 422)
@@ -175,9 +188,21 @@ def _list_responses(*endings: str) -> dict[int | str, dict[str, Any]]:
 
 
 def _join_errors(error: RequestValidationError) -> str:
-    return "; ".join(
-        f"{each['loc'][-1]}: {each['msg'].removeprefix('Value error, ')}" for each in error.errors()
-    )
+    return "; ".join(f"{each['loc'][-1]}: {_describe_mistake(each)}" for each in error.errors())
+
+
+def _describe_mistake(mistake: Mapping[str, Any]) -> str:
+    """Return what was expected of a form's field, and what was found."""
+    kind, context, found = mistake["type"], mistake.get("ctx", {}), str(mistake.get("input"))[:_LONGEST_FOUND]
+    match kind:
+        case "value_error":
+            # Our own text, or that of a file's field.
+            text = str(context["error"])
+            return "expected a file, found text" if text.startswith("Expected UploadFile") else text
+        case "extra_forbidden":
+            return "expected no such field; /openapi.json describes the fields"
+    expected = _EXPECTED.get(kind, mistake["msg"].removeprefix("Input should be ")).format(**context)
+    return f"expected {expected}, found {found!r}"
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,23 @@ LOWER = {"left": "upper.png", "right": "lower.png"}
 Ask = Callable[..., httpx.Response]
 
 ERRORS: dict[str, tuple[str, dict[str, str], dict[str, Any]]] = {
+    "model: expected no such field; /openapi.json describes the fields": ("/view", PAIR, {"model": "base"}),
+    "file: expected 'png' or 'jpg', found 'pfm'": ("/view", PAIR, {"file": "pfm"}),
+    "strength: expected a number of at least 0, found '-1'": ("/view", PAIR, {"strength": -1}),
+    "position: expected a number of at most 2, found '3'": ("/view", PAIR, {"position": 3}),
+    "focal_px: expected a number above 0, found '0'; rectify: expected true or false, found 'perhaps'": (
+        "/depth",
+        PAIR,
+        {"focal_px": 0, "rectify": "perhaps"},
+    ),
+    "baseline_m: expected a finite number, found 'inf'": ("/depth", PAIR, {"baseline_m": "inf"}),
+    "position: expected a number, found 'left'": ("/view", PAIR, {"position": "left"}),
+    "left: expected a file, found text": ("/view", {"right": "right.png"}, {"left": "left.png"}),
+    "range: expected the least and the greatest disparity, such as -20,150, found 'wide'": (
+        "/view",
+        PAIR,
+        {"range": "wide"},
+    ),
     "picture: expected a stereo picture, two views side by side or one above the other, found what looks "
     "like a single photograph (its halves do not resemble each other); give two files, left and right; or "
     "choose its layout, such as side_by_side (format)": (
