@@ -14,7 +14,6 @@ from stereoweave.cli.options import (
     Model,
     Port,
     Provider,
-    Threads,
     find_allowed_hosts,
     format_url,
     listen,
@@ -73,6 +72,12 @@ TokenFile = Annotated[
 # Syntax of a bearer token in RFC 6750.
 _TOKEN = r"[A-Za-z0-9\-._~+/]+=*"
 
+ReplicaThreads = Annotated[
+    int | None,
+    typer.Option(
+        "--threads", min=1, help="Number of CPU threads of each replica (default: a share of all cores)."
+    ),
+]
 Host = Annotated[
     str,
     typer.Option(
@@ -89,7 +94,7 @@ def serve(  # noqa: PLR0913 - each is an option of the command line
     model: Model = "small",
     provider: Provider = "cpu",
     replicas: Replicas = 1,
-    threads: Threads = None,
+    threads: ReplicaThreads = None,
     address: Address = None,
     batch: Batch = None,
     waiting: Waiting = 8,
