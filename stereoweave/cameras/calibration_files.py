@@ -60,7 +60,8 @@ def read_rig(path: str | Path, size_px: Size | None = None) -> Rig:
         text = _read_text(Path(path))
         if re.search(r"^(cam0|doffs|baseline)\s*=", text, re.MULTILINE):
             rig = _parse_middlebury(text)
-        elif re.search(r"^(P\d|P_rect_\d\d|K_\d\d):", text, re.MULTILINE):
+        # OpenCV names projection matrices P1 and P2 too, but begins them with a tag or a bracket.
+        elif re.search(r"^(P\d|P_rect_\d\d|K_\d\d):[ \t]*[-+.\d]", text, re.MULTILINE):
             rig = _parse_kitti(text, size_px)
         elif "cam0" in (entries := parse_entries(text)):
             rig = _parse_kalibr(entries)

@@ -376,6 +376,19 @@ def test_extrinsics_are_completed_by_the_intrinsics_beside_them(tmp_path):
 
 
 @pytest.mark.parametrize(
+    "projection",
+    [
+        "P1: [[550, 0, 320, 0], [0, 550, 240, 0], [0, 0, 1, 0]]",
+        "P1: !!opencv-matrix\n   rows: 1\n   cols: 1\n   dt: d\n   data: [ 1. ]",
+        "P1:\n- [550, 0, 320, 0]",
+    ],
+)
+def test_projection_matrices_in_an_opencv_file_do_not_make_it_kittis(tmp_path, projection):
+    rig = read_rig(stored(tmp_path, f"{OPENCV}{projection}\n"))
+    assert_same(rig, read_rig(stored(tmp_path, OPENCV)))
+
+
+@pytest.mark.parametrize(
     ("more", "found"),
     [
         ("image_size: 640", "a picture size '640' instead of width and height"),
