@@ -63,7 +63,7 @@ Left = Annotated[
     typer.Option(metavar="GLOB", help="Quoted pattern for the left pictures, such as 'left/*.png'."),
 ]
 Right = Annotated[
-    str | None, typer.Option(metavar="GLOB", help="Quoted pattern for the right pictures, in the same order.")
+    str | None, typer.Option(metavar="GLOB", help="Quoted pattern for the right pictures, paired by name.")
 ]
 Listed = Annotated[
     Path | None,

@@ -181,7 +181,7 @@ def find_pairs_among(folder: str | Path, paths: Iterable[str]) -> Listed:
     rest = sorted(set(pictures).difference(chain.from_iterable(halves)))
     if not (halves or doubles):
         doubles, rest = rest, []
-    whole, calibrations = Path(os.path.abspath(folder)).name, set(files[_CALIBRATION])  # noqa: PTH100
+    whole, calibrations = _absolute(folder).name, set(files[_CALIBRATION])
     pairs = [ListedPair(_name_pair(path, 1, whole), (path,)) for path in sorted(doubles)]
     for left, right in halves:
         beside = f"{left[: left.rfind('/') + 1]}{_CALIBRATION}"
@@ -212,11 +212,13 @@ def note_left_out(folder: str | Path, pictures: Sequence[str]) -> tuple[str, ...
 
 
 def find_pairs_by_globs(left: str, right: str) -> list[NamedPair]:
-    """Pair the pictures that match two patterns, such as 'left/*.png', in the order of their names.
+    """Pair the pictures that match two patterns, such as 'left/*.png', by their names without marks.
+
+    If no left picture has such a name in common with a right one, pair them in the order of their names.
 
     Raises:
-        StereoweaveError: A pattern matches nothing, the patterns match different numbers of files, or two
-            pairs have the same name.
+        StereoweaveError: A pattern matches nothing, the patterns match different numbers of files, a left
+            picture has no partner, or two pairs have the same name.
     """
     lefts, rights = _glob_files(left), _glob_files(right)
     for side, pattern, found in (("left", left, lefts), ("right", right, rights)):
@@ -230,8 +232,29 @@ def find_pairs_by_globs(left: str, right: str) -> list[NamedPair]:
             f"expected as many left pictures as right pictures, found {len(lefts)} for {left} and "
             f"{len(rights)} for {right}"
         )
-    fixed = takewhile(lambda part: not re.search(r"[*?\[]", part), Path(left).parent.parts)
-    return _make_pairs(zip(lefts, rights, strict=True), Path(*fixed))
+    by_name = dict(zip(_name_globbed(right, rights), rights, strict=True))
+    partners = [by_name.get(name) for name in _name_globbed(left, lefts)]
+    if not any(partners):
+        partners = [*rights]
+    pairs = []
+    for path, partner in zip(lefts, partners, strict=True):
+        if partner is None:
+            raise StereoweaveError(
+                f"{path}: expected a right picture of this name among those that match {right}, found none",
+                remedy=Remedy("add it, or list the pairs in a file", ("listed",)),
+            )
+        pairs.append((path, partner))
+    return _make_pairs(pairs, _find_root(left))
+
+
+def _find_root(pattern: str) -> Path:
+    """Return the innermost folder that contains all files that match a pattern."""
+    return Path(*takewhile(lambda part: not re.search(r"[*?\[]", part), Path(pattern).parent.parts))
+
+
+def _name_globbed(pattern: str, found: Sequence[Path]) -> list[str]:
+    root = _absolute(_find_root(pattern))
+    return [_name_pair(_path_below(root, path), 2, "") for path in found]
 
 
 def read_pair_list(path: Path) -> list[NamedPair]:
@@ -375,12 +398,10 @@ def _make_pairs(
     pictures: Iterable[tuple[Path, ...]], root: Path, names: Iterable[str] = repeat("")
 ) -> list[NamedPair]:
     """Create the pairs; a pair's name defaults to its path below `root` without marks."""
-    # Not `resolve`, which follows links; users must recognise the names.
-    above = Path(os.path.abspath(root))  # noqa: PTH100
+    above = _absolute(root)
     pairs = []
     for paths, given in zip(pictures, names, strict=False):
-        first = Path(os.path.abspath(paths[0]))  # noqa: PTH100
-        below = first.relative_to(above if first.is_relative_to(above) else first.anchor).as_posix()
+        below = _path_below(above, paths[0])
         name = _sanitize(given) if given else _name_pair(below, len(paths), above.name)
         beside = paths[0].parent / _CALIBRATION
         # Not Path.exists, which raises an error if a name is too long.
@@ -388,6 +409,17 @@ def _make_pairs(
         pairs.append(NamedPair(name, paths, beside if is_own else None))
     _check_names((pair.name, pair.pictures[0]) for pair in pairs)
     return pairs
+
+
+def _absolute(path: str | Path) -> Path:
+    # Not `resolve`, which follows links; users must recognise the names.
+    return Path(os.path.abspath(path))  # noqa: PTH100
+
+
+def _path_below(above: Path, path: Path) -> str:
+    """Return a path relative to an absolute folder, or to the root of the disk if it is elsewhere."""
+    path = _absolute(path)
+    return path.relative_to(above if path.is_relative_to(above) else path.anchor).as_posix()
 
 
 def _check_names(names: Iterable[tuple[str, str | Path]]) -> None:

@@ -201,6 +201,27 @@ def test_globs_are_paired_in_the_order_of_their_names(tmp_path):
     assert listed(folder, pairs) == {"1": ("l/1.png", "r/b.png"), "2": ("l/2.png", "r/c.png")}
 
 
+def test_globs_are_paired_by_their_names_without_marks_if_any_of_these_agree(tmp_path):
+    # In the order of names, scene_L comes after scene_Night_L, but scene_right before scene_Night_right.
+    names = [f"{scene}_{side}.png" for scene in ("scene", "scene_Night") for side in ("L", "right")]
+    folder = put(tmp_path, *names)
+    pairs = find_pairs_by_globs(f"{folder}/*_L.png", f"{folder}/*_right.png")
+    assert listed(folder, pairs) == {
+        "scene": ("scene_L.png", "scene_right.png"),
+        "scene_Night": ("scene_Night_L.png", "scene_Night_right.png"),
+    }
+
+
+def test_a_picture_of_a_glob_without_partner_is_refused_with_what_to_give(tmp_path):
+    folder = put(tmp_path, *(f"{number}_L.png" for number in "123"), *(f"{number}_R.png" for number in "234"))
+    with pytest.raises(
+        StereoweaveError,
+        match=r"1_L.png: expected a right picture of this name among those that match .*/\*_R.png, "
+        r"found none; add it, or list the pairs in a file \(listed\)$",
+    ):
+        find_pairs_by_globs(f"{folder}/*_L.png", f"{folder}/*_R.png")
+
+
 def test_names_from_globs_tell_folders_apart(tmp_path):
     folder = put(tmp_path, "a/left.png", "a/right.png", "b/c/left.png", "b/c/right.png")
     pairs = find_pairs_by_globs(f"{folder}/**/left.png", f"{folder}/**/right.png")
