@@ -29,6 +29,18 @@ _ENDINGS = {
     "raw": tuple(raw.ENDINGS - {".raw"}),
     "film": (".mp4", ".mkv", ".mk3d", ".mov", ".avi", ".webm"),
 }
+# The pictures among the files of a single result, by the file that every such result has.
+_RESULTS = {
+    "disparity.pfm": (
+        *("disparity.png", "disparity_scaled.png", "disparity.tiff", "depth.png", "depth.tiff"),
+        *("preview.png", "confidence.png", "occluded.png", "matched_left.png"),
+    ),
+    "distance.pfm": ("distance_preview.png", "distance_confidence.png", "panorama_left.png"),
+}
+# The name, without extension, that `view` gives to a file: the left picture's, and then the layout's.
+_VIEW = re.compile(
+    r"(.+)_(?:view|side_by_side|crossed|top_bottom|anaglyph|rgbd|quilt|contact_sheet|sweep|wiggle)(?:_[^/]*)?"
+)
 _SIDES = {"left": "right", "Left": "Right", "LEFT": "RIGHT", "l": "r", "L": "R", "im0": "im1", "cam0": "cam1"}
 _OTHER_SIDES = _SIDES | {right: left for left, right in _SIDES.items()}
 # Matches left, leftImg8bit and imgLeft, but not leftover; matches a single letter only at the start or the
@@ -165,7 +177,8 @@ def find_pairs_among(folder: str | Path, paths: Iterable[str]) -> Listed:
     cam1/a.png. If one picture is missing, the pair is still listed, and fails when it is read. A file with
     both views is also a pair. A camera raw file counts only if no picture beside it has its name. If there is
     no such pair or file, every picture is taken to hold both views. A calib.txt beside left.png, im0.png or
-    cam0.png belongs to that pair. Output folders of batches are ignored.
+    cam0.png belongs to that pair. Output folders of batches, the files of a single result and views of a pair
+    beside its left picture are ignored.
 
     Args:
         folder: Path or URL of the folder; a pair whose name consists only of marks is named after the folder.
@@ -178,7 +191,9 @@ def find_pairs_among(folder: str | Path, paths: Iterable[str]) -> Listed:
     files = _group_by_kind(paths)
     pictures = [*files["picture"], *_find_undeveloped(files["raw"], files["picture"])]
     halves, doubles = _pair_by_marks(pictures), files["both views"]
-    rest = sorted(set(pictures).difference(chain.from_iterable(halves)))
+    views = _find_views(halves, pictures)
+    halves = [pair for pair in halves if views.isdisjoint(pair)]
+    rest = sorted(set(pictures).difference(views, chain.from_iterable(halves)))
     if not (halves or doubles):
         doubles, rest = rest, []
     whole, calibrations = _absolute(folder).name, set(files[_CALIBRATION])
@@ -297,10 +312,11 @@ def _list_endings() -> str:
 
 
 def _group_by_kind(paths: Iterable[str]) -> dict[str, list[str]]:
-    """Group listed files by kind; drop files of unknown kind and those in output folders of batches."""
-    kinds: dict[str, list[str]] = {kind: [] for kind in (*_ENDINGS, BATCH_FILE, _CALIBRATION)}
+    """Group listed files by kind; drop files of unknown kind and those of batches and of single results."""
+    names = (BATCH_FILE, _CALIBRATION, *_RESULTS)
+    kinds: dict[str, list[str]] = {kind: [] for kind in (*_ENDINGS, *names)}
     kind_of = {ending: kind for kind, endings in _ENDINGS.items() for ending in endings}
-    kind_of |= {name: name for name in (BATCH_FILE, _CALIBRATION)}
+    kind_of |= {name: name for name in names}
     for path in paths:
         name = path.rpartition("/")[2]
         if kind := kind_of.get(splitext(name)[1].lower()) or kind_of.get(name):
@@ -311,6 +327,13 @@ def _group_by_kind(paths: Iterable[str]) -> dict[str, list[str]]:
             kind: [path for path in of if batches.isdisjoint(_list_parents(path))]
             for kind, of in kinds.items()
         }
+    made = {
+        path.removesuffix(first) + name
+        for first, names in _RESULTS.items()
+        for path in kinds[first]
+        for name in names
+    }
+    kinds["picture"] = [path for path in kinds["picture"] if path not in made]
     return kinds
 
 
@@ -318,6 +341,15 @@ def _find_undeveloped(raws: Sequence[str], pictures: Sequence[str]) -> list[str]
     """Return the raw files beside which the camera wrote no picture of the same name."""
     names = {splitext(path)[0] for path in pictures}
     return [path for path in raws if splitext(path)[0] not in names]
+
+
+def _find_views(halves: Sequence[tuple[str, str]], pictures: Sequence[str]) -> set[str]:
+    """Return the pictures that are views of a complete pair; a picture with a partner is none."""
+    there = set(pictures)
+    whole = [pair for pair in halves if there.issuperset(pair)]
+    lefts = {splitext(left)[0] for left, _ in whole}
+    unpaired = there.difference(chain.from_iterable(whole))
+    return {path for path in unpaired if (view := _VIEW.fullmatch(splitext(path)[0])) and view[1] in lefts}
 
 
 def _list_parents(path: str) -> list[str]:

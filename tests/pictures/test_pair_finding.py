@@ -3,6 +3,7 @@ from pathlib import Path
 import pytest
 
 from stereoweave.errors import StereoweaveError
+from stereoweave.outputs import results, sphere_depth
 from stereoweave.pictures.pair_finding import (
     FoundPairs,
     ListedPair,
@@ -13,6 +14,7 @@ from stereoweave.pictures.pair_finding import (
     find_pairs_in,
     read_pair_list,
 )
+from stereoweave.rendering.layouts import ANIMATIONS, LAYOUTS
 
 
 def put(folder: Path, *names: str) -> Path:
@@ -126,6 +128,48 @@ def test_hidden_files_and_results_of_a_batch_are_no_pictures(tmp_path):
     folder = put(tmp_path, "a_l.png", "a_r.png", "._a_l.png", ".trash/b_l.png")
     put(folder, "out/batch.json", "out/a/preview.png", "out/a/left.png", "out/a/right.png")
     assert listed(folder, find_pairs_in(folder).pairs) == {"a": ("a_l.png", "a_r.png")}
+
+
+@pytest.mark.parametrize(
+    ("marker", "files"),
+    [("disparity.pfm", results.FILES), ("distance.pfm", (*sphere_depth.FILES, sphere_depth.LEFT))],
+)
+def test_the_files_of_a_result_are_no_pictures_but_a_pair_beside_them_is_one(marker, files):
+    assert marker in files
+    pair = ["left.png", "right.png"]
+    for folder in ("", "left_depth/", "scenes/a/"):
+        made = [folder + file for file in files]
+        found = find_pairs_among("x", [*pair, *made, f"{folder}left.png", f"{folder}right.png"])
+        assert {each.files for each in found.pairs} == {
+            ("left.png", "right.png"),
+            (f"{folder}left.png", f"{folder}right.png"),
+        }
+        assert found.left_out == []
+
+
+def test_files_named_like_results_are_pictures_where_no_result_is():
+    found = find_pairs_among("x", ["left.png", "right.png", "preview.png", "a/disparity.pfm"])
+    assert found.left_out == ["preview.png"]
+
+
+@pytest.mark.parametrize("layout", ["view", *LAYOUTS, *ANIMATIONS])
+@pytest.mark.parametrize("left", ["left", "1_L"])
+def test_views_of_a_pair_beside_it_are_no_pictures(layout, left):
+    mark = LAYOUTS[layout].mark if layout in LAYOUTS else ""
+    pair = (f"{left}.png", {"left": "right.png", "1_L": "1_R.png"}[left])
+    found = find_pairs_among("x", [*pair, f"{left}_{layout}{mark}.webp"])
+    assert [each.files for each in found.pairs] == [pair]
+    assert found.left_out == []
+
+
+def test_pictures_named_like_views_are_the_user_s_where_the_rest_of_a_pair_is_found():
+    files = [f"{side}{more}.png" for side in ("left", "right") for more in ("", "_view")]
+    pairs = [each.files for each in find_pairs_among("x", [*files, "left_2.png", "tree_view.png"]).pairs]
+    assert pairs == [
+        ("left.png", "right.png"),
+        ("left_2.png", "right_2.png"),
+        ("left_view.png", "right_view.png"),
+    ]
 
 
 def test_two_pairs_of_one_name_are_refused_before_the_start_even_if_capitals_alone_differ(tmp_path):
