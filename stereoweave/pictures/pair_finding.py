@@ -275,9 +275,9 @@ def _name_globbed(pattern: str, found: Sequence[Path]) -> list[str]:
 def read_pair_list(path: Path) -> list[NamedPair]:
     """Read a list of pairs from a text file, one per line: left, right, and optionally the pair's name.
 
-    Columns are separated by tabs, commas or spaces; double quotes protect separators. A picture with both
-    views is alone on its line, or followed by an empty second column and its name. Paths are relative to the
-    list's folder. Empty lines and lines that begin with # are ignored.
+    Columns are separated by tabs, commas, semicolons or spaces; double quotes protect separators. A picture
+    with both views is alone on its line, or followed by an empty second column and its name. Paths are
+    relative to the list's folder. Empty lines and lines that begin with # are ignored.
 
     Raises:
         FormatError: The file is missing, empty or not text, or a line has more than three columns.
@@ -415,9 +415,10 @@ def _glob_files(pattern: str) -> list[Path]:
 
 
 def _split_columns(where: str, line: str) -> list[str]:
-    delimiter = next((character for character in "\t," if character in line), " ")
+    outside = re.sub(r'"[^"]*"', "", line)
+    delimiter = next((character for character in "\t,;" if character in outside), " ")
     try:
-        [row] = csv.reader([line.strip()], delimiter=delimiter, skipinitialspace=delimiter == ",")
+        [row] = csv.reader([line.strip()], delimiter=delimiter, skipinitialspace=delimiter in ",;")
     except csv.Error as error:
         raise FormatError(
             f"{where}: expected the left picture, the right picture and optionally a name, found a line that "
