@@ -172,13 +172,13 @@ def find_pairs_in(folder: Path) -> FoundPairs:
 def find_pairs_among(folder: str | Path, paths: Iterable[str]) -> Listed:
     """Find the pairs and videos among the files of a folder.
 
-    Two pictures are a pair if their paths differ only in their left/right marks: left/a.png and
-    right/a.png, a_L.png and a_R.png, left_01.png and right_01.png, im0.png and im1.png, cam0/a.png and
-    cam1/a.png. If one picture is missing, the pair is still listed, and fails when it is read. A file with
-    both views is also a pair. A camera raw file counts only if no picture beside it has its name. If there is
-    no such pair or file, every picture is taken to hold both views. A calib.txt beside left.png, im0.png or
-    cam0.png belongs to that pair. Output folders of batches, the files of a single result and views of a pair
-    beside its left picture are ignored.
+    Two pictures are a pair if their paths differ only in their left/right marks: left/a.png and right/a.png,
+    a_L.png and a_R.png, left_01.png and right_01.png, im0.png and im1.png, cam0/a.png and cam1/a.png. Their
+    file extensions may differ. If one picture is missing, the pair is still listed, and fails when it is
+    read. A file with both views is also a pair. A camera raw file counts only if no picture beside it has its
+    name. If there is no such pair or file, every picture is taken to hold both views. A calib.txt beside
+    left.png, im0.png or cam0.png belongs to that pair. Output folders of batches, the files of a single
+    result and views of a pair beside its left picture are ignored.
 
     Args:
         folder: Path or URL of the folder; a pair whose name consists only of marks is named after the folder.
@@ -368,31 +368,34 @@ def _pair_by_marks(paths: Sequence[str]) -> list[tuple[str, str]]:
 
 def _pair_by_mark(mark: re.Pattern[str], paths: Sequence[str]) -> list[tuple[str, str]]:
     there, pairs, settled = set(paths), set(), set()
+    by_stem = {splitext(path)[0]: path for path in paths}
     for path in paths:
-        if path not in settled and (marked := _swap_sides(mark, path)):
+        stem, ending = splitext(path)
+        if path not in settled and (marked := _swap_sides(mark, stem)):
             others, is_left = marked
-            partner = next((other for other in others if other in there), others[0])
+            found = (other + ending if other + ending in there else by_stem.get(other) for other in others)
+            partner = next(filter(None, found), others[0] + ending)
             pairs.add((path, partner) if is_left else (partner, path))
-            if partner == others[0]:  # the partner's own first choice is this path
+            if partner == others[0] + ending:  # the partner's own first choice is this path
                 settled.add(partner)
     return sorted(pairs) if any(there.issuperset(pair) for pair in pairs) else []
 
 
-def _swap_sides(mark: re.Pattern[str], path: str) -> tuple[list[str], bool] | None:
+def _swap_sides(mark: re.Pattern[str], stem: str) -> tuple[list[str], bool] | None:
     """Return the other picture's possible paths, and whether this picture is the left one.
 
-    The other path has all marks swapped, or only the last mark. Return None if the path has no marks.
+    All paths lack the file extension. The other path has all marks swapped, or only the last mark. Return
+    None if the path has no marks.
     """
-    stem, ending = splitext(path)
     parts = stem.split("/")
     swapped = [_swap_marks(mark, part) for part in parts]
     places = [place for place, (part, other) in enumerate(zip(parts, swapped, strict=True)) if part != other]
     if not places:
         return None
     last = places[-1]
-    others = ["/".join(swapped) + ending]
+    others = ["/".join(swapped)]
     if len(places) > 1:
-        others.append("/".join((*parts[:last], *swapped[last:])) + ending)
+        others.append("/".join((*parts[:last], *swapped[last:])))
     return others, mark.findall(parts[last])[-1] in _SIDES
 
 

@@ -98,6 +98,15 @@ def test_half_a_pair_is_a_pair_whose_other_picture_is_missing(tmp_path):
     }
 
 
+def test_the_pictures_of_a_pair_may_have_different_file_extensions():
+    files = ["a_L.JPG", "a_R.jpg", "b_L.png", "b_R.jpg", "c_L.jpg", "c_R.jpg"]
+    assert find_pairs_among("x", files).pairs == [
+        ListedPair("a", ("a_L.JPG", "a_R.jpg")),
+        ListedPair("b", ("b_L.png", "b_R.jpg")),
+        ListedPair("c", ("c_L.jpg", "c_R.jpg")),
+    ]
+
+
 def test_marks_mean_nothing_where_not_one_pair_is_whole(tmp_path):
     folder = put(tmp_path, "turn_left.jpg", "sea.jpg")
     assert listed(folder, find_pairs_in(folder).pairs) == {
