@@ -88,12 +88,16 @@ def read_viewpoint(tags: Tags) -> int:
     return value if isinstance(value, int) else 0
 
 
-def read_lens(tags: Tags, width_px: int, height_px: int) -> Lens | None:
+def read_lens(
+    tags: Tags, width_px: int, height_px: int, *, stored_width_px: int | None = None
+) -> Lens | None:
     """Return the focal length and the baseline for views of this size; None if the tags have neither.
 
     The views must show the camera's full image, at any scale; for a crop, the focal length would be wrong.
+    `stored_width_px` is the width of the whole picture, as stored, if it holds both views.
     """
-    lens = Lens(focal_px=_find_focal_px(tags, width_px, height_px), baseline_m=_find_baseline_m(tags))
+    focal_px = _find_focal_px(tags, width_px, height_px, stored_width_px or width_px)
+    lens = Lens(focal_px=focal_px, baseline_m=_find_baseline_m(tags))
     return lens if lens.is_known else None
 
 
@@ -129,11 +133,11 @@ def _read_multi_picture_tags(content: bytes) -> dict[int, Any]:
     return tags
 
 
-def _find_focal_px(tags: Tags, width_px: int, height_px: int) -> float | None:
+def _find_focal_px(tags: Tags, width_px: int, height_px: int, stored_width_px: int) -> float | None:
     diagonal_px = math.hypot(width_px, height_px)
     lengths_px = (
         _find_focal_on_film_px(tags, diagonal_px),
-        _find_focal_on_sensor_px(tags, width_px),
+        _find_focal_on_sensor_px(tags, width_px, stored_width_px),
     )
     plausible = (take_plausible_focal_px(px, width_px, height_px) for px in lengths_px)
     return next((px for px in plausible if px), None)
@@ -144,7 +148,7 @@ def _find_focal_on_film_px(tags: Tags, diagonal_px: float) -> float | None:
     return of_film_mm / _FILM_DIAGONAL_MM * diagonal_px if of_film_mm else None
 
 
-def _find_focal_on_sensor_px(tags: Tags, width_px: int) -> float | None:
+def _find_focal_on_sensor_px(tags: Tags, width_px: int, stored_width_px: int) -> float | None:
     focal_mm, density = (
         _parse_positive(tags.get(Base.FocalLength)),
         _parse_positive(tags.get(Base.FocalPlaneXResolution)),
@@ -152,7 +156,9 @@ def _find_focal_on_sensor_px(tags: Tags, width_px: int) -> float | None:
     taken_px = _parse_positive(tags.get(Base.ExifImageWidth))
     unit_mm = _UNIT_MM.get(tags.get(Base.FocalPlaneResolutionUnit, 2))
     if focal_mm and density and taken_px and unit_mm:
-        return focal_mm * density / unit_mm * width_px / taken_px
+        # Cameras write the width of the whole picture, programs that join two pictures also that of one.
+        scale = 1 if taken_px == width_px else stored_width_px / taken_px
+        return focal_mm * density / unit_mm * scale
     return None
 
 

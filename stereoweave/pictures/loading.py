@@ -244,7 +244,7 @@ def _open_one(path: Path, format: str | None, sphere: SphereRequest) -> Opened:
             *_note_turns(lies),
             *_note_colours([decoded]),
         ),
-        lens=exif.read_lens(decoded.tags, width_px, height_px),
+        lens=exif.read_lens(decoded.tags, width_px, height_px, stored_width_px=decoded.image.width),
         projection=_read_projection(path, xmp, (width_px, height_px), sphere),
     )
 

@@ -25,6 +25,7 @@ from stereoweave.stereo import Estimate, StereoPair
 
 TEXTURED = Path(__file__).resolve().parents[1] / "textured_pair"
 ORIENTATION, EXIF, FOCAL_35_MM, MODEL = 0x0112, 0x8769, 0xA405, 0x0110
+FOCAL_MM, WIDTH_PX, PLANE_X, PLANE_UNIT = 0x920A, 0xA002, 0xA20E, 0xA210
 FINE = {"quality": 97, "subsampling": 0}
 
 
@@ -617,6 +618,27 @@ def test_any_kind_of_pixels_becomes_rgb(tmp_path, mode):
 
 
 # The lens
+
+
+@pytest.mark.parametrize(
+    ("layout", "size", "lies", "taken_px", "focal_px"),
+    [
+        ("side_by_side", (480, 160), 1, 480, 400),
+        ("side_by_side", (480, 160), 1, 960, 200),  # scaled down by 2 since
+        ("side_by_side", (480, 160), 1, 240, 400),  # the width is that of one view
+        ("side_by_side", (160, 480), 6, 160, 400),  # stored upright and to be turned
+        ("side_by_side_half", (240, 160), 1, 240, 400),
+        ("top_bottom", (240, 320), 1, 240, 400),
+    ],
+)
+def test_a_focal_length_on_the_sensor_is_that_of_one_view_of_a_whole_picture(
+    tmp_path, layout, size, lies, taken_px, focal_px
+):
+    tags = tagged(lies)
+    # 8 mm at 50 px per mm are 400 px of the picture as it was taken.
+    tags.get_ifd(EXIF).update({FOCAL_MM: 8.0, PLANE_X: 50.0, PLANE_UNIT: 4, WIDTH_PX: taken_px})
+    Image.new("RGB", size).save(tmp_path / "both.png", exif=tags)
+    assert open_pictures([tmp_path / "both.png"], layout).lens.focal_px == pytest.approx(focal_px)
 
 
 def test_the_lens_is_that_of_one_view_wherever_it_is_written(tmp_path, pair):
