@@ -47,7 +47,7 @@ def _write_photo(path: Path) -> None:
 
 def _read(path: Path) -> None:
     if path.suffix == ".heic":
-        mark_views(path.read_bytes(), _CAMERA, 96)
+        mark_views(path.read_bytes(), _CAMERA, (96, 64))
     else:
         write_marks(path, _MARKS)
 

@@ -56,17 +56,17 @@ def write_spatial_photo(
     with replacing(path) as temporary:
         # Devices decode only halved colours.
         file.save(temporary, quality=_QUALITY, chroma=420)
-        marked = mark_views(temporary.read_bytes(), camera, left.shape[1])
+        marked = mark_views(temporary.read_bytes(), camera, (left.shape[1], left.shape[0]))
         temporary.write_bytes(marked)
 
 
-def mark_views(content: bytes, camera: StereoCamera | None, width_px: int) -> bytes:
+def mark_views(content: bytes, camera: StereoCamera | None, size_px: tuple[int, int]) -> bytes:
     """Return a HEIC file of two pictures with a group that says that they are a left and a right view.
 
     Args:
         content: The file, as libheif writes it.
         camera: Camera of the views, of parallel directions; None if it is unknown.
-        width_px: Width of a view.
+        size_px: Width and height of a view.
 
     Raises:
         FormatError: The file is damaged, has not two pictures, or is stored in another way.
@@ -77,7 +77,7 @@ def mark_views(content: bytes, camera: StereoCamera | None, width_px: int) -> by
         raise FormatError(f"{_UNKNOWN} {len(metas)} boxes meta, or pictures before it")
     old = boxes[metas[0]]
     views = _find_views(_children(old))
-    properties = _make_properties(camera, width_px)
+    properties = _make_properties(camera, size_px)
     grown = _add_properties(old.content[_META_HEAD:], views, properties)
     grown += make_box(b"grpl", make_box(b"ster", struct.pack(">5I", 0, _GROUP, 2, *views)))
     by = _META_HEAD + len(grown) + 8 - len(old.whole)
@@ -108,16 +108,25 @@ def _find_views(parts: dict[bytes, bytes]) -> tuple[int, int]:
     return views[0], views[1]
 
 
-def _make_properties(camera: StereoCamera | None, width_px: int) -> tuple[list[bytes], list[bytes]]:
+def _make_properties(
+    camera: StereoCamera | None, size_px: tuple[int, int]
+) -> tuple[list[bytes], list[bytes]]:
     """Return the properties of the left and of the right view; none for a camera beyond their numbers."""
     if camera is None:
         return [], []
-    middle = 1 << _SHIFT - 1
-    focal = round(camera.focal_px / width_px * (1 << _SHIFT))
+    # The shares are of the size as stored, which is even because of the halved colours. The principal point
+    # counts from the picture's corner.
+    width_px, height_px = (side_px + side_px % 2 for side_px in size_px)
+    shares = (
+        camera.focal_px / width_px,
+        (camera.cx_px + 0.5) / width_px,
+        (camera.cy_px + 0.5) / height_px,
+    )
+    numbers = [round(share * (1 << _SHIFT)) for share in shares]
     x_um = round(1e6 * camera.baseline_m)
-    if max(focal, x_um) > _MOST:
+    if max(x_um, *map(abs, numbers)) > _MOST:
         return [], []
-    intrinsics = make_box(b"uuid", _INTRINSICS + struct.pack(">I3i", _SHIFT << 8, focal, middle, middle))
+    intrinsics = make_box(b"uuid", _INTRINSICS + struct.pack(">I3i", _SHIFT << 8, *numbers))
     left = make_box(b"uuid", EXTRINSICS_UUID + bytes(4))
     right = make_box(b"uuid", EXTRINSICS_UUID + struct.pack(">Ii", _HAS_X, x_um))
     return [intrinsics, left], [intrinsics, right]

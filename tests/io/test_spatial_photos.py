@@ -48,6 +48,19 @@ def test_libheif_reads_the_group_with_the_left_view_first(tmp_path):
     ] * 2
 
 
+def test_the_camera_of_pictures_of_odd_size_is_kept(tmp_path):
+    # libheif stores 159x95 px as 160x96, and gives lengths for the stored size.
+    camera = StereoCamera(focal_px=240.0, baseline_m=0.0635, cx_px=89.5, cy_px=-10.5)
+    write_spatial_photo(tmp_path / "photo.heic", LEFT[:95, :159], RIGHT[:95, :159], camera)
+    assert open_pictures([tmp_path / "photo.heic"]).lens.focal_px == 240.0
+    for picture in open_heif(tmp_path / "photo.heic"):
+        matrix = picture.info["heif"]["camera_intrinsic_matrix"]
+        assert picture.size == (159, 95)
+        # Counted from the corner of the first pixel; libheif's cut to the odd size adds half a pixel.
+        assert matrix["principal_point_x"] == pytest.approx(90.5)
+        assert matrix["principal_point_y"] == pytest.approx(-9.5)
+
+
 def test_without_a_camera_only_the_group_is_added(tmp_path):
     write_spatial_photo(tmp_path / "photo.heic", LEFT, RIGHT)
     opened = open_pictures([tmp_path / "photo.heic"])
@@ -56,7 +69,7 @@ def test_without_a_camera_only_the_group_is_added(tmp_path):
     assert open_heif(tmp_path / "photo.heic").info["entity_groups"][0]["type"] == "ster"
 
 
-@pytest.mark.parametrize("changes", [{"focal_px": 1280.0}, {"baseline_m": 2148.0}])
+@pytest.mark.parametrize("changes", [{"focal_px": 1280.0}, {"cx_px": -1281.0}, {"baseline_m": 2148.0}])
 def test_a_camera_beyond_the_format_s_numbers_is_left_out(tmp_path, changes):
     # The numbers have 32 bits: a focal length of less than 8 widths, and micrometres.
     write_spatial_photo(tmp_path / "photo.heic", LEFT, RIGHT, replace(CAMERA, **changes))
@@ -66,7 +79,7 @@ def test_a_camera_beyond_the_format_s_numbers_is_left_out(tmp_path, changes):
 
 
 def test_pixels_stay_as_they_are(tmp_path, plain):
-    (tmp_path / "marked.heic").write_bytes(mark_views(plain, CAMERA, 160))
+    (tmp_path / "marked.heic").write_bytes(mark_views(plain, CAMERA, (160, 96)))
     file = open_heif(tmp_path / "marked.heic")
     np.testing.assert_array_equal(np.asarray(file[0]), LEFT)  # the primary picture is lossless
 
@@ -94,7 +107,7 @@ def test_items_with_extents_that_count_from_the_file_s_start_move_too(tmp_path, 
 
     content = boxes[0].whole + make_box(b"meta", meta[:4] + change_boxes(changed, (b"iloc",), moved))
     content += b"".join(box.whole for box in boxes[2:])
-    (tmp_path / "marked.heic").write_bytes(mark_views(content, CAMERA, 160))
+    (tmp_path / "marked.heic").write_bytes(mark_views(content, CAMERA, (160, 96)))
     file = open_heif(tmp_path / "marked.heic")
     assert file.info["entity_groups"][0]["images"] == [0, 1]
     np.testing.assert_array_equal(np.asarray(file[0]), LEFT)
@@ -120,7 +133,7 @@ DAMAGED = {
         old, (b"iinf",), lambda table: table[:6] + split_boxes(table[6:])[0].whole
     ),
     "a hidden picture": lambda old: old.replace(b"infe\2\0\0\0", b"infe\2\0\0\1", 1),
-    "a group already": lambda old: mark_views(old, None, 160),
+    "a group already": lambda old: mark_views(old, None, (160, 96)),
     "no properties": lambda old: old.replace(b"ipco", b"free", 1),
     "no owners of properties": lambda old: old.replace(b"ipma", b"free", 1),
     "another table of owners": lambda old: changed(old, (b"iprp", b"ipma"), lambda table: b"\1" + table[1:]),
@@ -144,7 +157,7 @@ DAMAGED = {
 @pytest.mark.parametrize("damage", DAMAGED)
 def test_a_damaged_file_is_refused_in_one_line(plain, damage):
     with pytest.raises(FormatError) as caught:
-        mark_views(DAMAGED[damage](plain), CAMERA, 160)
+        mark_views(DAMAGED[damage](plain), CAMERA, (160, 96))
     assert str(caught.value).startswith("expected ") and "\n" not in str(caught.value)
 
 
