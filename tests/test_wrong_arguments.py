@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import stereoweave as sw
+from stereoweave import io
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.arrays import as_rgb
 from stereoweave.io.images import read_image
@@ -68,6 +69,9 @@ def wrong_values() -> dict[str, Any]:
         "a record array": np.zeros((64, 96), [("r", "u1"), ("g", "u1")]),
         "an empty picture": LEFT[:0],
         "floats": FLAT,
+        "a picture of floats": LEFT / 255,
+        "a picture of 16 bits": LEFT.astype(np.uint16),
+        "a picture of two channels": LEFT[..., :2],
         "a masked map": np.ma.MaskedArray(FLAT, mask=FLAT > 0),
         "a matrix of floats": np.matrix(FLAT),
         "a map of objects": FLAT.astype(object),
@@ -147,6 +151,16 @@ def calls() -> list[Call]:
         Call("StereoMatcher.setMinDisparity", opencv.setMinDisparity, minDisparity=0),
         Call("StereoMatcher.setROI1", opencv.setROI1, roi1=(0, 0, 96, 64)),
         Call("read_image", sw.read_image, path=TEXTURED / "left.png"),
+        Call("read_pair", io.read_pair, left=TEXTURED / "left.png", right=TEXTURED / "right.png"),
+        Call("write_image", io.write_image, path=Path("image.png"), image=LEFT),
+        Call("write_pfm", io.write_pfm, path="map.pfm", values=FLAT),
+        Call("read_pfm", io.read_pfm, path="map.pfm"),
+        Call("write_npy", io.write_npy, path="map.npy", values=FLAT),
+        Call("write_float_tiff", io.write_float_tiff, path="map.tiff", values=FLAT),
+        Call("write_depth_png", io.write_depth_png, path="depth.png", depth_m=FLAT),
+        Call("write_disparity_png", io.write_disparity_png, path="map.png", disparity_px=FLAT),
+        Call("read_disparity_png", io.read_disparity_png, path="map.png"),
+        Call("write_scaled_disparity_png", io.write_scaled_disparity_png, path="s.png", disparity_px=FLAT),
         Call("as_rgb", as_rgb, image=LEFT, name="picture"),
     ]
 
@@ -184,6 +198,8 @@ def test_every_argument_of_the_interface_is_tested():
     functions = ("estimate", "fit_screen", "render", "synthesize", "read_image")
     for name in (*functions, "Matcher", "StereoCamera", "StereoMatcher", "StereoPair", "Estimate"):
         assert tried[name] == set(inspect.signature(getattr(sw, name)).parameters), name
+    for name in set(io.__all__) - {"RangeError"}:
+        assert tried[name] == set(inspect.signature(getattr(io, name)).parameters), name
     assert set(sw.__all__) - {name.split(".")[0] for name in tried} == {
         *("FormatError", "MatcherError", "StereoweaveError", "Sample", "View", "__version__")
     }

@@ -9,7 +9,7 @@ from jaxtyping import UInt8, UInt16
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
-from stereoweave.arguments import check_kind
+from stereoweave.arguments import check_kind, describe, is_plain_array
 from stereoweave.errors import FormatError, Remedy, StereoweaveError
 from stereoweave.io.decoding import read_picture
 from stereoweave.io.exif import read_orientation
@@ -81,6 +81,10 @@ def make_pair(
 
 def write_image(path: str | Path, image: UInt8[np.ndarray, "h w 3"] | UInt8[np.ndarray, "h w"]) -> None:
     """Write an RGB or grey image; the file extension, such as .png, determines the format."""
+    check_kind("path", path, str, Path)
+    is_bytes = is_plain_array(image) and image.dtype == np.uint8
+    if not is_bytes or image.ndim not in (2, 3) or image.shape[2:] not in ((), (3,)):
+        raise StereoweaveError(f"image: expected uint8 [H, W, 3] or [H, W], got {describe(image)}")
     save_picture(path, image, picture_kind(path))
 
 

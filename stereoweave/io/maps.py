@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Shaped
 from PIL import Image
 
+from stereoweave.arguments import check_array, check_kind
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io.decoding import check_regular, check_size, decode_values, open_picture
 from stereoweave.io.files import reading, replacing
@@ -39,6 +40,7 @@ def read_pfm(path: str | Path) -> Float32[np.ndarray, "h w"]:
         FormatError: The file is missing, has another format, three channels ('PF'), no pixels, more pixels
             than `read_image` accepts, an invalid scale, or a length that contradicts its header.
     """
+    check_kind("path", path, str, Path)
     check_regular(Path(path), "a PFM file")
     with reading(path, "a PFM file"), Path(path).open("rb") as file:
         (width_px, height_px), order, start = _parse_pfm_header(path, file.read(_LONGEST_PFM_HEADER))
@@ -73,20 +75,29 @@ def _parse_pfm_header(path: str | Path, content: bytes) -> tuple[tuple[int, int]
 
 def write_pfm(path: str | Path, values: Float[np.ndarray, "h w"]) -> None:
     """Write a single-channel PFM file in little-endian float32; NaN and infinity are kept."""
+    _check_map(path, "values", values)
     with replacing(path) as temporary:
         Image.fromarray(values.astype(np.float32)).save(temporary, "PPM")
 
 
 def write_float_tiff(path: str | Path, values: Float[np.ndarray, "h w"]) -> None:
     """Write a single-channel TIFF file in float32, uncompressed; NaN and infinity are kept."""
+    _check_map(path, "values", values)
     with replacing(path) as temporary, checking_format_size(path, values.shape):
         Image.fromarray(values.astype(np.float32)).save(temporary, "TIFF")
 
 
 def write_npy(path: str | Path, values: Float[np.ndarray, "h w"]) -> None:
     """Write a NumPy .npy file in float32; NaN and infinity are kept."""
+    _check_map(path, "values", values)
     with replacing(path) as temporary:
         np.save(temporary, values.astype(np.float32), allow_pickle=False)
+
+
+def _check_map(path: object, name: str, values: object) -> None:
+    """Raise a StereoweaveError if a map to write is no plain array of floats, or its path is no path."""
+    check_kind("path", path, str, Path)
+    check_array(name, values, "f", 2)
 
 
 def read_pixels(path: str | Path, *modes: str) -> Shaped[np.ndarray, "h w *channels"]:
@@ -112,6 +123,7 @@ def read_disparity_png(path: str | Path) -> Float32[np.ndarray, "h w"]:
     The values are px * 256 (KITTI's format), unless text chunks give another scale and an offset, as in the
     files of `write_scaled_disparity_png`.
     """
+    check_kind("path", path, str, Path)
     expected = "a 16-bit grey PNG of disparity * 256"
     with open_picture(Path(path), expected=expected) as picture:
         if not picture.mode.startswith("I"):
@@ -144,6 +156,7 @@ def write_disparity_png(path: str | Path, disparity_px: Float[np.ndarray, "h w"]
     Raises:
         RangeError: A known value is below 0 or above 255.99 px; nothing is written.
     """
+    _check_map(path, "disparity_px", disparity_px)
     known = np.isfinite(disparity_px)
     low_px, high_px = _find_range_px(disparity_px)
     if find_scale(low_px, high_px):
@@ -179,6 +192,7 @@ def write_scaled_disparity_png(path: str | Path, disparity_px: Float[np.ndarray,
     disparity_offset_px contain both (`find_scale`; 1/256 and 0 if KITTI's format can hold the range);
     disparity_unknown_value is 0.
     """
+    _check_map(path, "disparity_px", disparity_px)
     known = np.isfinite(disparity_px)
     scale_px, offset_px = find_scale(*_find_range_px(disparity_px)) or (_STEP_PX, 0.0)
     steps = np.rint((np.where(known, disparity_px, 0).astype(np.float64) - offset_px) / scale_px)
@@ -195,5 +209,6 @@ def _find_range_px(disparity_px: Float[np.ndarray, "h w"]) -> tuple[float, float
 
 def write_depth_png(path: str | Path, depth_m: Float[np.ndarray, "h w"]) -> None:
     """Write depth as a 16-bit PNG in millimetres; unknown depth and depth beyond 65.535 m become 0."""
+    _check_map(path, "depth_m", depth_m)
     depth_mm = np.rint(depth_m * 1000)
     save_picture(path, np.where((depth_mm > 0) & (depth_mm <= 65535), depth_mm, 0).astype(np.uint16), "PNG")
