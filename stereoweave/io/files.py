@@ -4,7 +4,7 @@ import re
 import stat
 import tempfile
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from uuid import uuid4
 
@@ -12,7 +12,8 @@ from stereoweave.errors import FormatError, Remedy, StereoweaveError, reason
 
 # Real calibrations and training recipes have a few kilobytes.
 MOST_SMALL_BYTES = 256 * 1024
-# Names of the temporary files of `replacing`.
+# Names of the temporary files of `replacing`: as 255 bytes are the most, they have a part of the stem only.
+_LONGEST_STEM = 50
 _TEMPORARY = re.compile(r"\..*-[0-9a-f]{8}(\.\w+)?")
 _ANOTHER = Remedy("choose another place for the output")
 # Errors that libraries raise for damaged files, such as OverflowError for infinite sizes and RuntimeError (as
@@ -100,14 +101,17 @@ def replacing(path: str | Path) -> Iterator[Path]:
         StereoweaveError: The folder or the file cannot be written.
     """
     target = Path(path)
-    temporary = make_folder(target.parent) / f".{target.stem}-{uuid4().hex[:8]}{target.suffix}"
+    stem = target.stem[:_LONGEST_STEM]
+    temporary = make_folder(target.parent) / f".{stem}-{uuid4().hex[:8]}{target.suffix}"
     try:
         yield temporary
         temporary.replace(target)
     except OSError as error:
         raise StereoweaveError(f"{path}: expected a writable file, found {reason(error)}") from error
     finally:
-        temporary.unlink(missing_ok=True)
+        # Removing a file of an invalid name would hide the error.
+        with suppress(OSError):
+            temporary.unlink()
 
 
 def is_leftover(path: Path) -> bool:

@@ -340,8 +340,8 @@ def _list_entries(folder: Path) -> list[os.DirEntry[str]]:
 
 
 def _read_status(entry: os.DirEntry[str]) -> os.stat_result | None:
-    """Return the status of a file; None if the entry is not a file, or has just been removed."""
-    with suppress(FileNotFoundError):
+    """Return the status of a file; None if the entry is not a file that can be reached."""
+    with suppress(OSError):  # such as one that has just been removed, or a link to itself
         return entry.stat() if entry.is_file() else None
     return None
 

@@ -35,6 +35,25 @@ def test_an_error_leaves_the_earlier_file_and_nothing_else(tmp_path, error):
     assert list(tmp_path.iterdir()) == [target]
 
 
+# 255 bytes are the most.
+@pytest.mark.parametrize("stem", ["a" * 251, "\N{CAMERA}" * 62], ids=["letters", "wide"])
+def test_the_longest_names_can_be_written(tmp_path, stem):
+    with files.replacing(tmp_path / f"{stem}.png") as temporary:
+        temporary.write_text("new")
+        assert files.is_leftover(temporary)
+    assert [path.stem for path in tmp_path.iterdir()] == [stem]
+
+
+def test_a_name_that_is_too_long_is_a_one_line_error(tmp_path):
+    for name in ("a" * 300, f"a.{'b' * 300}"):
+        with (
+            pytest.raises(StereoweaveError, match="expected a writable file, found file name too long$"),
+            files.replacing(tmp_path / name) as temporary,
+        ):
+            temporary.write_text("new")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_written_file_has_the_usual_permissions(tmp_path, picture):
     (tmp_path / "plain").touch()
     images.write_image(tmp_path / "picture.png", picture)

@@ -152,6 +152,12 @@ def test_links_to_files_are_followed_and_links_to_folders_are_not(tmp_path):
     assert [file[:2] for file in store_at(tmp_path).files()] == [("a/b.png", 3), ("a/c.png", 3)]
 
 
+def test_a_link_that_leads_to_itself_is_left_out(tmp_path):
+    (tmp_path / "loop.png").symlink_to("loop.png")
+    (tmp_path / "other.png").touch()
+    assert [file.path for file in store_at(tmp_path).files()] == ["other.png"]
+
+
 def test_a_file_that_is_removed_while_it_is_listed_is_left_out(tmp_path):
     (tmp_path / "a").write_bytes(b"1")
     [entry] = stores._list_entries(tmp_path)
