@@ -16,6 +16,8 @@ _LEAST_FOCAL_PX = 1
 # Tolerances for files with few decimals; they amount to a few hundredths of a pixel in a 4000 px picture.
 _ROTATION_OFF, _SAME_PX, _SAME_DIRECTION = 1e-5, 1e-2, 1e-3
 _ROUNDED = 1e-3
+# Heights in metres are wrong by as much, because a rectified camera has one focal length.
+_SQUARE = 1e-3
 
 Size = tuple[int, int]
 
@@ -116,6 +118,8 @@ class Rig:
             return "a right camera that is not exactly to the right of the left one"
         if np.abs((left - right)[[0, 1, 1], [0, 1, 2]]).max() > _SAME_PX:
             return "cameras with different focal lengths or with principal points in different rows"
+        if abs(left[0, 0] - left[1, 1]) > _SQUARE * left[0, 0]:
+            return "pixels that are not square"
         return None
 
     def camera(self) -> StereoCamera:

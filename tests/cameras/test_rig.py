@@ -7,6 +7,7 @@ from rig_examples import fisheye, pinhole, rig_of, turned
 
 from stereoweave.cameras import rig as calibration
 from stereoweave.cameras.calibration_files import add_camera, read_rig, write_rig
+from stereoweave.cameras.rectify import rectify
 from stereoweave.cameras.rig import Optics, Rig
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.stereo import StereoCamera, StereoPair
@@ -470,6 +471,16 @@ def test_only_a_rectified_rig_gives_a_camera(tmp_path):
     ):
         with pytest.raises(StereoweaveError, match=reason):
             unlike.camera()
+
+
+def test_a_rig_whose_pixels_are_not_square_gives_a_camera_only_after_rectification():
+    matrix = np.array([[800, 0, 99.5], [0, 400, 79.5], [0, 0, 1.0]])
+    rig = calibration.make_rectified_rig(matrix, matrix, -0.1)
+    with pytest.raises(StereoweaveError, match="found pixels that are not square; rectify the pictures"):
+        rig.camera()
+    assert rectify(pair_of(200, 160), rig).pair.camera.focal_px == 600  # the mean
+    rounded = matrix + np.diag([0, 400.3, 0])
+    assert calibration.make_rectified_rig(rounded, rounded, -0.1).camera().focal_px == 800
 
 
 def test_the_rig_of_a_rectified_pair_is_written_and_gives_its_camera(tmp_path):
