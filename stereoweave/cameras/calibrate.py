@@ -1,11 +1,11 @@
 """Stereo calibration from pictures of a chessboard or ChArUco board."""
 
-import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from posixpath import splitext
 from typing import Any, NamedTuple
 
 import cv2
@@ -23,6 +23,8 @@ from stereoweave.cameras.rig import Optics, Rig, Size, format_size
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io.decoding import ENDINGS
 from stereoweave.io.images import read_image
+from stereoweave.io.side_marks import pair_by_marks
+from stereoweave.io.stores import store_at
 from stereoweave.system.steps import step
 
 FEWEST_PAIRS = 5
@@ -35,8 +37,6 @@ _GLANCES, _AGREEING_GLANCES, _EMPTY_GLANCES = 6, 3, 8
 _GOOD_PX, _FAIR_PX = 0.5, 1.0
 _GOOD_COVER_PERCENT, _FAIR_COVER_PERCENT = 60, 40
 _GOOD_PAIRS, _GOOD_TILT_DEGREES = 10, 15
-_SIDE = re.compile(r"(?<![a-z])(left|right|cam0|cam1|l|r)(?![a-z])", re.IGNORECASE)
-_LEFT_WORDS = {"left", "cam0", "l"}
 # OpenCV 4 keeps the fisheye flags in cv2.fisheye.
 _FISHEYE_FLAGS: Any = cv2 if hasattr(cv2, "CALIB_FIX_SKEW") else cv2.fisheye
 _ITERATIONS = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-7)
@@ -238,29 +238,25 @@ def find_pairs(folder: Path) -> tuple[dict[str, tuple[Path, Path]], dict[str, st
     """Return both pictures of each pair, by name, and the reason why each other picture is left out."""
     if not folder.is_dir():
         raise StereoweaveError(f"{folder}: expected a folder with pictures of a board, found no such folder")
-    sides: dict[str, dict[bool, Path]] = {}
+    files = [file.path for file in store_at(folder).files()]
+    pictures = [path for path in files if Path(path).suffix.lower() in ENDINGS]
+    pairs: dict[str, tuple[str, str]] = {}
     left_out: dict[str, str] = {}
-    for path in sorted(folder.rglob("*")):
-        relative = path.relative_to(folder).with_suffix("").as_posix()
-        marks = _SIDE.findall(relative)
-        if path.suffix.lower() in ENDINGS and marks:
-            views = sides.setdefault(_SIDE.sub("*", relative), {})
-            view = views.setdefault(marks[-1].lower() in _LEFT_WORDS, path)
-            if view != path:
-                left_out[str(path.relative_to(folder))] = f"{view.name} is a picture of the same view"
-    pairs = {str(key): (found[True], found[False]) for key, found in sides.items() if len(found) == 2}
-    left_out |= {
-        str(path.relative_to(folder)): "the picture of the other camera is missing"
-        for found in sides.values()
-        for path in found.values()
-        if len(found) == 1
-    }
+    for pair in pair_by_marks(pictures):
+        there = [path for path in pair if path in pictures]
+        if len(there) == 1:
+            left_out[there[0]] = "the picture of the other camera is missing"
+            continue
+        used = pairs.setdefault(splitext(pair[0])[0], pair)
+        for path, first in zip(pair, used, strict=True):
+            if path != first:
+                left_out[path] = f"{Path(first).name} is a picture of the same view"
     if not pairs:
         raise StereoweaveError(
             f"{folder}: expected pairs of pictures, such as left/01.png and right/01.png or 01_L.png and "
-            f"01_R.png, found none among {len(list(folder.rglob('*')))} files"
+            f"01_R.png, found none among {len(files)} files"
         )
-    return {left.relative_to(folder).as_posix(): (left, right) for left, right in pairs.values()}, left_out
+    return {left: (folder / left, folder / right) for left, right in pairs.values()}, left_out
 
 
 def _find_all_corners(

@@ -6,7 +6,6 @@ import os
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from itertools import chain, repeat, takewhile
 from pathlib import Path
 from posixpath import splitext
@@ -16,6 +15,7 @@ from stereoweave.errors import FormatError, Remedy, StereoweaveError
 from stereoweave.io import raw
 from stereoweave.io.decoding import ENDINGS
 from stereoweave.io.files import reading
+from stereoweave.io.side_marks import pair_by_marks, strip_marks
 from stereoweave.io.stores import store_at
 
 BATCH_FILE, SUMMARY_FILE = "batch.json", "summary.csv"
@@ -41,16 +41,6 @@ _RESULTS = {
 _VIEW = re.compile(
     r"(.+)_(?:view|side_by_side|crossed|top_bottom|anaglyph|rgbd|quilt|contact_sheet|sweep|wiggle)(?:_[^/]*)?"
 )
-_SIDES = {"left": "right", "Left": "Right", "LEFT": "RIGHT", "l": "r", "L": "R", "im0": "im1", "cam0": "cam1"}
-_OTHER_SIDES = _SIDES | {right: left for left, right in _SIDES.items()}
-# Matches left, leftImg8bit and imgLeft, but not leftover; matches a single letter only at the start or the
-# end of a name.
-_MARK = re.compile(
-    r"(?<![A-Za-z])(?:left|right|LEFT|RIGHT)(?![a-z])|(?:Left|Right)(?![a-z])"
-    r"|^[lLrR](?=$|[ _.-])|(?<![A-Za-z])[lLrR]$|^im[01]$"
-)
-# In paths without such a mark, because cam0_left.png is a left picture.
-_CAMERA_MARK = re.compile(r"(?<![A-Za-z])cam[01](?![A-Za-z0-9])")
 _NOT_IN_NAMES = re.compile(r'[<>:"/\\|?*\x00-\x1f]')
 # Names of Windows devices, and of a batch's own files and folders.
 _TAKEN = re.compile(
@@ -190,7 +180,7 @@ def find_pairs_among(folder: str | Path, paths: Iterable[str]) -> Listed:
     """
     files = _group_by_kind(paths)
     pictures = [*files["picture"], *_find_undeveloped(files["raw"], files["picture"])]
-    halves, doubles = _pair_by_marks(pictures), files["both views"]
+    halves, doubles = pair_by_marks(pictures), files["both views"]
     views = _find_views(halves, pictures)
     halves = [pair for pair in halves if views.isdisjoint(pair)]
     rest = sorted(set(pictures).difference(views, chain.from_iterable(halves)))
@@ -358,58 +348,6 @@ def _list_parents(path: str) -> list[str]:
     return ["/".join(parts[:count]) for count in reversed(range(len(parts)))]
 
 
-def _pair_by_marks(paths: Sequence[str]) -> list[tuple[str, str]]:
-    """Pair the paths that contain a mark, as (left, right); return an empty list if no pair is complete.
-
-    Numbers of cameras are marks only if no pair is complete without them.
-    """
-    return _pair_by_mark(_MARK, paths) or _pair_by_mark(_CAMERA_MARK, paths)
-
-
-def _pair_by_mark(mark: re.Pattern[str], paths: Sequence[str]) -> list[tuple[str, str]]:
-    there, pairs, settled = set(paths), set(), set()
-    by_stem = {splitext(path)[0]: path for path in paths}
-    for path in paths:
-        stem, ending = splitext(path)
-        if path not in settled and (marked := _swap_sides(mark, stem)):
-            others, is_left = marked
-            found = (other + ending if other + ending in there else by_stem.get(other) for other in others)
-            partner = next(filter(None, found), others[0] + ending)
-            pairs.add((path, partner) if is_left else (partner, path))
-            if partner == others[0] + ending:  # the partner's own first choice is this path
-                settled.add(partner)
-    return sorted(pairs) if any(there.issuperset(pair) for pair in pairs) else []
-
-
-def _swap_sides(mark: re.Pattern[str], stem: str) -> tuple[list[str], bool] | None:
-    """Return the other picture's possible paths, and whether this picture is the left one.
-
-    All paths lack the file extension. The other path has all marks swapped, or only the last mark. Return
-    None if the path has no marks.
-    """
-    parts = stem.split("/")
-    swapped = [_swap_marks(mark, part) for part in parts]
-    places = [place for place, (part, other) in enumerate(zip(parts, swapped, strict=True)) if part != other]
-    if not places:
-        return None
-    last = places[-1]
-    others = ["/".join(swapped)]
-    if len(places) > 1:
-        others.append("/".join((*parts[:last], *swapped[last:])))
-    return others, mark.findall(parts[last])[-1] in _SIDES
-
-
-def _split_path(path: str) -> list[str]:
-    """Split a path into its parts, without the file extension."""
-    return splitext(path)[0].split("/")
-
-
-# Cached, because most pictures are in the same folder as the previous one.
-@lru_cache(maxsize=1000)
-def _swap_marks(mark: re.Pattern[str], part: str) -> str:
-    return mark.sub(lambda found: _OTHER_SIDES[found[0]], part)
-
-
 def _glob_files(pattern: str) -> list[Path]:
     if Path(pattern).is_file():  # even if its name contains wildcards
         return [Path(pattern)]
@@ -476,21 +414,8 @@ def _check_names(names: Iterable[tuple[str, str | Path]]) -> None:
 
 def _name_pair(path: str, pictures: int, whole: str) -> str:
     """Name a pair after its first picture's path without marks, or after the folder if nothing remains."""
-    parts = _split_path(path)
-    if pictures == 2:
-        mark = _find_mark(parts)
-        parts = [_strip_marks(mark, part) for part in parts]
+    parts = strip_marks(path) if pictures == 2 else splitext(path)[0].split("/")
     return _sanitize("_".join(filter(None, parts)) or whole)
-
-
-@lru_cache(maxsize=1000)
-def _strip_marks(mark: re.Pattern[str], part: str) -> str:
-    return "_".join(filter(None, (piece.strip(" _.-") for piece in mark.split(part))))
-
-
-def _find_mark(parts: Sequence[str]) -> re.Pattern[str]:
-    """Return the pattern of the marks that say which side a path is of."""
-    return _MARK if any(map(_MARK.search, parts)) else _CAMERA_MARK
 
 
 def _sanitize(name: str) -> str:
@@ -501,5 +426,4 @@ def _sanitize(name: str) -> str:
 
 def _owns_calibration(path: str, pictures: int) -> bool:
     """Return whether a calibration file beside a pair's first picture belongs to that pair alone."""
-    parts = _split_path(path)
-    return pictures == 2 and _find_mark(parts).fullmatch(parts[-1]) is not None
+    return pictures == 2 and not strip_marks(path)[-1]

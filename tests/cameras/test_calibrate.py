@@ -164,7 +164,14 @@ def test_pairs_of_another_size_than_most_are_left_out(copied):
 
 
 @pytest.mark.parametrize(
-    "names", [("left{}.png", "right{}.png"), ("{}_L.png", "{}_R.png"), ("cam0/{}.png", "cam1/{}.png")]
+    "names",
+    [
+        ("left{}.png", "right{}.png"),
+        ("{}_L.png", "{}_R.png"),
+        ("cam0/{}.png", "cam1/{}.png"),
+        ("imgLeft{}.png", "imgRight{}.png"),
+        ("board_l_{}.png", "board_r_{}.jpg"),
+    ],
 )
 def test_pairs_are_known_by_their_names(tmp_path, names):
     for name in names:
@@ -172,7 +179,8 @@ def test_pairs_are_known_by_their_names(tmp_path, names):
             path = tmp_path / name.format(number)
             path.parent.mkdir(exist_ok=True)
             path.touch()
-    (tmp_path / "notes.txt").touch()
+    for name in ("notes.txt", "._01_L.png"):  # macOS writes hidden files beside pictures
+        (tmp_path / name).touch()
     pairs, left_out = find_pairs(tmp_path)
     assert [[str(path.relative_to(tmp_path)) for path in pair] for pair in pairs.values()] == [
         [name.format(number) for name in names] for number in ("01", "02")
@@ -187,6 +195,14 @@ def test_a_second_picture_of_a_view_is_left_out_by_name(tmp_path):
     pairs, left_out = find_pairs(tmp_path)
     assert pairs == {"left/01.jpg": (tmp_path / "left" / "01.jpg", tmp_path / "right" / "01.png")}
     assert left_out == {"left/01.png": "01.jpg is a picture of the same view"}
+
+
+def test_a_picture_without_partner_is_left_out_by_name(tmp_path):
+    for name in ("1_L.png", "1_R.png", "2_R.png"):
+        (tmp_path / name).touch()
+    pairs, left_out = find_pairs(tmp_path)
+    assert list(pairs) == ["1_L.png"]
+    assert left_out == {"2_R.png": "the picture of the other camera is missing"}
 
 
 @pytest.mark.parametrize("name", ["CharucoBoard", "DICT_9X9_50"])
