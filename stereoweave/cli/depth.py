@@ -1,10 +1,8 @@
 """The commands `stereoweave depth` and `stereoweave measure`."""
 
 import json
-import re
 from collections.abc import Sequence
 from dataclasses import asdict
-from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -178,13 +176,14 @@ def _write_whole(pictures: Sequence[Path], out: Path, job: "DepthJob", *, many: 
 
 def _name_results(pictures: Sequence[Path], left: str | None, listed: Path | None) -> Path:
     """Return the folder for the results if the user names none."""
+    from stereoweave.pictures.pair_finding import find_root
+
     if pictures or listed:
         given = listed or pictures[0]
         # The name of "." is that of the current folder.
         name = given.absolute().resolve().name if given.is_dir() else given.stem
     else:
-        fixed = takewhile(lambda part: not re.search(r"[*?\[]", part), Path(left or "").parent.parts)
-        name = Path(*fixed).name
+        name = find_root(left or "").name
     return Path(f"{name}_depth" if name else "depth")
 
 

@@ -249,16 +249,16 @@ def find_pairs_by_globs(left: str, right: str) -> list[NamedPair]:
                 remedy=Remedy("add it, or list the pairs in a file", ("listed",)),
             )
         pairs.append((path, partner))
-    return _make_pairs(pairs, _find_root(left))
+    return _make_pairs(pairs, find_root(left))
 
 
-def _find_root(pattern: str) -> Path:
+def find_root(pattern: str) -> Path:
     """Return the innermost folder that contains all files that match a pattern."""
     return Path(*takewhile(lambda part: not re.search(r"[*?\[]", part), Path(pattern).parent.parts))
 
 
 def _name_globbed(pattern: str, found: Sequence[Path]) -> list[str]:
-    root = _absolute(_find_root(pattern))
+    root = _absolute(find_root(pattern))
     return [_name_pair(_path_below(root, path), 2, "") for path in found]
 
 
