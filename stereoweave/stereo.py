@@ -229,7 +229,7 @@ class Estimate:
 
 
 def check_fits(estimate: Estimate, pair: StereoPair) -> None:
-    """Require an estimate of the same size as the pair."""
+    """Require an estimate of the same size as the pair, and of its images if the estimate holds a pair."""
     check_kind("estimate", estimate, Estimate)
     check_kind("pair", pair, StereoPair)
     found, expected = estimate.disparity_px.shape, pair.left.shape[:2]
@@ -237,6 +237,10 @@ def check_fits(estimate: Estimate, pair: StereoPair) -> None:
         raise StereoweaveError(
             f"estimate: expected the size of the images, {expected[1]}x{expected[0]}, "
             f"got {found[1]}x{found[0]}; use an estimate made from these images"
+        )
+    if estimate.pair is not None and not _has_same_images(estimate.pair, pair):
+        raise StereoweaveError(
+            "pair: expected the images that the estimate belongs to, found others; use estimate.pair"
         )
 
 
@@ -393,6 +397,13 @@ def _refuse(outside: ArrayOrTensor, expected: str) -> None:
             f"{expected}, or NaN where unknown, found {outside[0].item()}; "
             "raise the maximum, or set such pixels to NaN"
         )
+
+
+def _has_same_images(one: StereoPair, other: StereoPair) -> bool:
+    return all(
+        own is others or np.array_equal(own, others)
+        for own, others in ((one.left, other.left), (one.right, other.right))
+    )
 
 
 def _size(image: np.ndarray) -> str:

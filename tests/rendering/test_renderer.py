@@ -217,6 +217,20 @@ def test_sizes_that_differ_are_refused_in_one_line(rng):
         render(left[:, 1:], right[:, 1:], estimate, 0.5)
 
 
+def test_an_estimate_of_an_aligned_pair_fits_no_other_pair(rng):
+    left, right, estimate = random_scene(rng)
+    aligned = replace(estimate, pair=StereoPair(left=left, right=right))
+    swapped = StereoPair(left=right, right=left)
+    with pytest.raises(
+        ValueError, match=r"^pair: expected the images that .+, found others; use estimate\.pair"
+    ):
+        Renderer(swapped, aligned)
+    same = StereoPair(left=left.copy(), right=right.copy())
+    np.testing.assert_array_equal(
+        Renderer(same, aligned).view(0.5).image, render(left, right, estimate, 0.5).image
+    )
+
+
 @pytest.mark.parametrize("convergence_px", [0, 2, 10])
 @pytest.mark.parametrize("position", [0.0, 0.5, 1.0])
 def test_convergence_keeps_its_plane_in_place(convergence_px, position):
