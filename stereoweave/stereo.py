@@ -246,7 +246,10 @@ def check_fits(estimate: Estimate, pair: StereoPair) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """Synthesised image, uint8 RGB [H, W, 3]; `drawn`, bool [H, W], is True at pixels that a camera saw."""
+    """Synthesised image, uint8 RGB [H, W, 3]; `drawn`, bool [H, W], is True at pixels that a camera saw.
+
+    It is False where part of the colour may come from a border without content (`StereoPair.left_seen`).
+    """
 
     image: UInt8[np.ndarray, "h w 3"]
     drawn: Bool[np.ndarray, "h w"]

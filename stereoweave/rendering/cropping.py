@@ -5,6 +5,7 @@ from collections.abc import Iterable
 import numpy as np
 from jaxtyping import Bool
 
+from stereoweave.cameras.rectify import find_content
 from stereoweave.errors import Remedy, StereoweaveError
 from stereoweave.rendering.renderer import Renderer
 
@@ -18,13 +19,16 @@ def find_common_part(
 ) -> tuple[slice, slice]:
     """Return the rows and columns that are left when the invented borders of all these views are cut off.
 
-    Holes inside the picture do not count.
+    Holes inside the picture do not count. Borders without content count, as rectification leaves them.
 
     Raises:
         StereoweaveError: The views have less than 32x32 pixels in common.
     """
-    drawn = [renderer.view(position, up=up, forward=forward).drawn for position in positions]
-    height, width = drawn[0].shape
+    views = [renderer.view(position, up=up, forward=forward).drawn for position in positions]
+    height, width = views[0].shape
+    # Borders that rectification leaves are slanted: each of their rows and columns ends elsewhere.
+    rows, columns = find_content(renderer.pair)
+    drawn = [view[rows, columns] for view in views]
     start, stop = _find_ends(drawn)
     inside = [view[:, start:stop].T for view in drawn]
     top, bottom = _find_ends(inside) if start < stop else (0, 0)
@@ -35,7 +39,10 @@ def find_common_part(
             setting="crop",
             remedy=Remedy("take viewpoints nearer to the cameras", ("position", "strength")),
         )
-    return slice(top, bottom), slice(start, stop)
+    return (
+        slice(rows.start + top, rows.start + bottom),
+        slice(columns.start + start, columns.start + stop),
+    )
 
 
 def _find_ends(masks: list[Bool[np.ndarray, "h w"]]) -> tuple[int, int]:

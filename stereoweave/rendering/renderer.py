@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, Num, UInt8
+from jaxtyping import Bool, Float, Float32, Num, UInt8
 
 from stereoweave.arguments import check_kind, check_number
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.arrays import ImageLike, as_rgb
 from stereoweave.matching.exposure import match_exposure, recolour
+from stereoweave.matching.left_right_check import at_match
 from stereoweave.stereo import Estimate, StereoCamera, StereoPair, View, assume_camera, check_fits
 from stereoweave.system.threads import in_bands, thread_count
 
@@ -85,8 +86,10 @@ class Renderer:
         position = check_position(position, strength=self.strength, up=up, forward=forward)
         moves = bool(self.convergence_px or up or forward)
         if position in (0, 1) and not moves:
-            image = self.pair.right if position else self.pair.left
-            return View(image=image.copy(), drawn=np.ones(image.shape[:2], bool))
+            pair = self.pair
+            image, seen = (pair.right, pair.right_seen) if position else (pair.left, pair.left_seen)
+            drawn = np.ones(image.shape[:2], bool) if seen is None else seen.copy()
+            return View(image=image.copy(), drawn=drawn)
         canvas = self._draw(float(position))
         if up or forward:
             from stereoweave.rendering.camera_motion import move_camera
@@ -135,6 +138,9 @@ class Renderer:
             hidden = self.find_background(right=position > 1)
             paint_background(*hidden, (right if position > 1 else left).shift, left.offset_px, canvas)
         fill(canvas)
+        for side, seen in ((left, self.pair.left_seen), (right, self.pair.right_seen)):
+            if seen is not None:
+                canvas.drawn[:] &= _is_content(seen, side, canvas.surface_px)
         return canvas
 
     def find_background(self, right: bool) -> "HiddenBackground":
@@ -190,8 +196,9 @@ def render(  # noqa: PLR0913 - the options of one view
             camera of the estimate's pair, or one whose focal length is the image width.
 
     Returns:
-        The view, which has the same size as the images; `drawn` is False in filled holes. The view from
-        position 0 or 1 is the image itself.
+        The view, which has the same size as the images; `drawn` is False in filled holes, and where an
+        image's border without content, as rectification leaves it, may show. The view from position 0 or 1 is
+        the image itself.
 
     Raises:
         ValueError: The sizes differ, or a number is out of range.
@@ -266,6 +273,14 @@ def _make_side(
         offset_px=0.0,
         nearness=0.0,
     )
+
+
+def _is_content(
+    seen: Bool[np.ndarray, "h w"], side: "Side", surface_px: Float32[np.ndarray, "h w"]
+) -> Bool[np.ndarray, "h w"]:
+    """Return the mask of the view's pixels that lie in an image's content, or outside the image."""
+    content, inside = at_match(seen.astype(np.uint8), side.shift * surface_px + side.offset_px, -1)
+    return (content > 0) | ~inside
 
 
 def _recolour(

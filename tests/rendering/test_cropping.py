@@ -1,5 +1,7 @@
 """The common part of views of a wall, by hand."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -48,6 +50,16 @@ def test_from_above_the_upper_rows_are_cut_off(pair):
     renderer = Renderer(*pair, threads=1)
     rows, columns = find_common_part(renderer, [0.5], up=0.5)
     assert (rows, columns) == (slice(4, HEIGHT), slice(0, WIDTH))  # 0.5 baselines at a disparity of 8
+
+
+def test_slanted_borders_without_content_are_cut_off(pair):
+    # A border as a rotation leaves it: one column narrower in every fourth row.
+    rows, columns = np.indices((HEIGHT, WIDTH))
+    images, estimate = pair
+    slanted = replace(images, left_seen=columns >= 12 - rows // 4, right_seen=columns < WIDTH - 20)
+    renderer = Renderer(slanted, estimate, threads=1)
+    # At 0.5, the wall of disparity 8 moves by 4 px: the left border to the left, the right one to the right.
+    assert find_common_part(renderer, [0.0, 0.5, 1.0]) == (slice(0, HEIGHT), slice(12, WIDTH - 20))
 
 
 def test_views_with_too_little_in_common_are_refused(pair):

@@ -242,6 +242,27 @@ def test_convergence_keeps_its_plane_in_place(convergence_px, position):
     np.testing.assert_array_equal(np.flatnonzero(is_object)[[0, -1]], [np.ceil(first), np.floor(first + 5)])
 
 
+@pytest.mark.parametrize(
+    ("position", "up", "columns", "rows"),
+    [
+        (0.0, 0.0, slice(6, 40), slice(0, 12)),
+        (1.0, 0.0, slice(0, 30), slice(0, 12)),
+        # The wall has disparity 4: the left image moves by 2 px to the left, the right one to the right.
+        (0.5, 0.0, slice(4, 32), slice(0, 12)),
+        (0.5, 0.5, slice(4, 32), slice(2, 12)),
+    ],
+)
+def test_what_lies_outside_an_image_s_content_is_not_drawn(position, up, columns, rows):
+    left_seen, right_seen = np.ones((2, 12, 40), bool)
+    left_seen[:, :6] = right_seen[:, 30:] = False
+    image = np.tile(BACKGROUND, (12, 40, 1))
+    pair = StereoPair(left=image, right=image, left_seen=left_seen, right_seen=right_seen)
+    view = Renderer(pair, make_estimate(*np.full((2, 12, 40), 4.0))).view(position, up=up)
+    expected = np.zeros((12, 40), bool)
+    expected[rows, columns] = True
+    np.testing.assert_array_equal(view.drawn, expected)
+
+
 def test_strength_widens_the_baseline_about_the_middle(rng):
     left, right, estimate = random_scene(rng)
     pair = StereoPair(left=left, right=right)
