@@ -1,5 +1,7 @@
 """Checks of arguments of the Python interface; each raises a one-line StereoweaveError.
 
+Checks of numbers return Python's own float or int, which the caller keeps.
+
 NumPy is imported only inside the functions, because the command line's help imports this module and must be
 fast.
 """
@@ -21,16 +23,21 @@ _LEAST_LIKENESS = 0.7  # "gpu" is no slip for "cpu"
 _DTYPES = {"f": "floats", "u": "uint8", "b": "booleans"}
 
 
-def check_number(name: str, value: object) -> None:
-    """Require a real number that a float can represent; NaN and infinity are allowed."""
+def check_number(name: str, value: object) -> float:
+    """Return a real number as a float; NaN and infinity are allowed.
+
+    A NumPy scalar would make Numba compile every kernel again, and a ratio cannot be formatted.
+    """
     if not isinstance(value, Real) or isinstance(value, bool) or not _is_held_by_float(value):
         raise StereoweaveError(f"{name}: expected a number, got {describe(value)}")
+    return float(value)
 
 
-def check_whole_number(name: str, value: object) -> None:
-    """Require an integer within the range of a float."""
+def check_whole_number(name: str, value: object) -> int:
+    """Return an integer within the range of a float as an int."""
     if not isinstance(value, Integral) or isinstance(value, bool) or not _is_held_by_float(value):
         raise StereoweaveError(f"{name}: expected a whole number, got {describe(value)}")
+    return int(value)
 
 
 def as_two_numbers(
@@ -45,9 +52,7 @@ def as_two_numbers(
     numbers = tuple(cast("Sequence[float]", value)) if is_row else ()
     if len(numbers) != 2:
         raise StereoweaveError(f"expected {expected}, got {describe(value)}", setting=setting, remedy=remedy)
-    for number in numbers:
-        check_number(setting, number)
-    return float(numbers[0]), float(numbers[1])
+    return check_number(setting, numbers[0]), check_number(setting, numbers[1])
 
 
 def check_choice(

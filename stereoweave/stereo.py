@@ -49,7 +49,7 @@ class StereoCamera:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            check_number(name, value)
+            object.__setattr__(self, name, check_number(name, value))
         # Smaller values underflow to 0 in float32 and give no depth.
         for name in ("focal_px", "baseline_m"):
             value = getattr(self, name)
@@ -317,10 +317,11 @@ class DepthCurve:
             value = getattr(self, name)
             if value is None:
                 continue
-            check_number(name, value)
+            value = check_number(name, value)
+            object.__setattr__(self, name, value)
             if not 0 < value < math.inf:
                 raise StereoweaveError(f"{name} must be positive and finite, got {value}")
-        check_number("exponent", self.exponent)
+        object.__setattr__(self, "exponent", check_number("exponent", self.exponent))
         if not 1 <= self.exponent < math.inf:
             raise StereoweaveError(f"exponent must be finite and at least 1, got {self.exponent}")
 

@@ -1,9 +1,11 @@
-"""Choices of a setting, and what is suggested for a wrong one."""
+"""Choices of a setting, what is suggested for a wrong one, and numbers of any kind."""
+
+from fractions import Fraction
 
 import numpy as np
 import pytest
 
-from stereoweave.arguments import check_choice
+from stereoweave.arguments import check_choice, check_number, check_whole_number
 from stereoweave.errors import MatcherError, StereoweaveError
 
 LAYOUTS = ["side_by_side", "side_by_side_half", "top_bottom", "wiggle"]
@@ -45,3 +47,15 @@ def test_an_array_of_names_is_no_choice():
 
 def test_a_choice_is_accepted():
     check_choice("layout", "wiggle", LAYOUTS)
+
+
+@pytest.mark.parametrize("half", [0.5, np.float16(0.5), np.longdouble(0.5), Fraction(1, 2)])
+def test_a_number_of_any_kind_becomes_a_float(half):
+    number = check_number("strength", half)
+    assert (type(number), number) == (float, 0.5)
+
+
+@pytest.mark.parametrize("two", [2, np.int8(2), np.uint64(2)])
+def test_a_whole_number_of_any_kind_becomes_an_int(two):
+    number = check_whole_number("threads", two)
+    assert (type(number), number) == (int, 2)

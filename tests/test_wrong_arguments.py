@@ -3,6 +3,7 @@
 import inspect
 import math
 from collections.abc import Callable
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,10 @@ def wrong_values() -> dict[str, Any]:
         "NaN": math.nan,
         "infinity": math.inf,
         "a fraction": 1.5,
+        "a half of NumPy": np.float16(0.5),
+        "a wide float of NumPy": np.longdouble(0.5),
+        "a whole number of NumPy": np.int8(1),
+        "a ratio": Fraction(1, 2),
         "a complex number": 1j,
         "minus one": -1,
         "2 ** 80": 2**80,

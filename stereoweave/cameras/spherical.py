@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float32
 
-from stereoweave.arguments import check_choice
+from stereoweave.arguments import check_choice, check_number
 from stereoweave.errors import Remedy, StereoweaveError
 
 Rays = Float32[np.ndarray, "3 h w"]
@@ -152,6 +152,9 @@ class SphereRequest:
     def __post_init__(self) -> None:
         if self.projection is not None:
             check_choice("projection", self.projection, PROJECTIONS)
+        for setting in ("fov_deg", "lens_fov_deg"):
+            if (value := getattr(self, setting)) is not None:
+                object.__setattr__(self, setting, check_number(setting, value))
         for setting, value in (("look_deg", self.look_deg), ("fov_deg", self.fov_deg)):
             if self.whole and value is not None:
                 raise StereoweaveError(

@@ -56,10 +56,10 @@ class Renderer:
         fine: tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w 3"]] | None = None,
     ) -> None:
         check_fits(estimate, pair)
-        _check_shifts(strength, convergence_px, pair)
         _check_fine(fine, pair)
-        self.pair, self.estimate = pair, estimate
-        self.strength, self.convergence_px, self.fine = strength, convergence_px, fine
+        self.pair, self.estimate, self.fine = pair, estimate, fine
+        self.strength = check_strength(strength)
+        self.convergence_px = check_convergence_px(convergence_px, pair.left.shape[1])
         self._threads = min(_MOST_THREADS, thread_count(threads))
         maps_px = estimate.disparity_px, estimate.right_disparity_px
         with ThreadPoolExecutor(self._threads) as pool:
@@ -84,13 +84,14 @@ class Renderer:
             forward: Distance from that line towards the scene, in baselines; from -1 to 1.
         """
         position = check_position(position, strength=self.strength, up=up, forward=forward)
+        up, forward = float(up), float(forward)
         moves = bool(self.convergence_px or up or forward)
         if position in (0, 1) and not moves:
             pair = self.pair
             image, seen = (pair.right, pair.right_seen) if position else (pair.left, pair.left_seen)
             drawn = np.ones(image.shape[:2], bool) if seen is None else seen.copy()
             return View(image=image.copy(), drawn=drawn)
-        canvas = self._draw(float(position))
+        canvas = self._draw(position)
         if up or forward:
             from stereoweave.rendering.camera_motion import move_camera
 
@@ -107,7 +108,7 @@ class Renderer:
         if position in (0, 1) and not self.convergence_px:
             return self.fine[int(position)].copy()
         # The kernels add a half, which rounds where images are of whole numbers.
-        return np.clip(self._draw(float(position)).image - np.float32(0.5), 0, 255)
+        return np.clip(self._draw(position).image - np.float32(0.5), 0, 255)
 
     def _draw(self, position: float) -> "Canvas":
         """Render the view from a position on the line through the cameras, with holes filled."""
@@ -212,8 +213,8 @@ def render(  # noqa: PLR0913 - the options of one view
 
 def check_position(position: float, *, strength: float = 1.0, up: float = 0.0, forward: float = 0.0) -> float:
     """Return the position at this strength; raise a StereoweaveError if no view can be seen from there."""
-    for name, value in (("position", position), ("up", up), ("forward", forward)):
-        check_number(name, value)
+    position = check_number("position", position)
+    up, forward = check_number("up", up), check_number("forward", forward)
     seen_from = 0.5 + strength * (position - 0.5)
     if not FIRST_POSITION <= seen_from <= LAST_POSITION:
         between = f"{FIRST_POSITION:g} to {LAST_POSITION:g} (0 is the left camera and 1 the right one)"
@@ -229,17 +230,23 @@ def check_position(position: float, *, strength: float = 1.0, up: float = 0.0, f
     return seen_from
 
 
-def _check_shifts(strength: float, convergence_px: float, pair: StereoPair) -> None:
-    check_number("strength", strength)
-    check_number("convergence_px", convergence_px)
+def check_strength(strength: float) -> float:
+    """Return a strength as a float; raise a StereoweaveError if it is negative or not finite."""
+    strength = check_number("strength", strength)
     if not 0 <= strength < math.inf:
         raise StereoweaveError(f"expected 0 or more, got {strength}", setting="strength")
-    width = pair.left.shape[1]
-    if not abs(convergence_px) <= width:
+    return strength
+
+
+def check_convergence_px(convergence_px: float, width_px: int) -> float:
+    """Return a convergence as a float; raise a StereoweaveError if it exceeds the width of the picture."""
+    convergence_px = check_number("convergence_px", convergence_px)
+    if not abs(convergence_px) <= width_px:
         raise StereoweaveError(
-            f"expected -{width} to {width} px (the picture's width), got {convergence_px}",
+            f"expected -{width_px} to {width_px} px (the picture's width), got {convergence_px}",
             setting="convergence_px",
         )
+    return convergence_px
 
 
 def _check_fine(fine: object, pair: StereoPair) -> None:

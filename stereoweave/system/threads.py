@@ -21,7 +21,7 @@ def thread_count(threads: int | None) -> int:
         StereoweaveError: The requested number is out of range.
     """
     if threads is not None:
-        check_whole_number("threads", threads)
+        threads = check_whole_number("threads", threads)
         if not 1 <= threads <= _MOST_THREADS:
             raise StereoweaveError(
                 f"expected a number from 1 to {_MOST_THREADS}, got {threads}", setting="threads"

@@ -179,11 +179,11 @@ class Settings:
         self._set(**found)
 
     def _set(self, **numbers: int) -> None:
-        for name, number in numbers.items():
-            check_whole_number(name, number)
+        whole = {name: check_whole_number(name, number) for name, number in numbers.items()}
+        for name, number in whole.items():
             if not -_LARGEST_INT <= number <= _LARGEST_INT:
                 raise StereoweaveError(f"{name}: expected a number that fits in 32 bits, got {number}")
-        changed = self._numbers | {name: int(number) for name, number in numbers.items()}
+        changed = self._numbers | whole
         _check_range(changed["minDisparity"], changed["numDisparities"])
         self._numbers = changed
 
@@ -205,6 +205,5 @@ def _check_rectangle(name: str, rectangle: Sequence[int]) -> Rectangle:
         raise StereoweaveError(
             f"{name}: expected a rectangle (x, y, width, height), got {describe(rectangle)}"
         ) from error
-    for number in (x, y, width, height):
-        check_whole_number(name, number)
-    return int(x), int(y), int(width), int(height)
+    x, y, width, height = (check_whole_number(name, number) for number in (x, y, width, height))
+    return x, y, width, height

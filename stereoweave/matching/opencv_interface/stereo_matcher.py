@@ -83,7 +83,7 @@ class StereoMatcher(Settings):
             P2=P2,
             mode=mode,
         )
-        check_number("min_confidence", min_confidence)
+        min_confidence = check_number("min_confidence", min_confidence)
         check_flag("refined", refined)
         self._refined, self._min_confidence = refined, min_confidence
         if not 0 <= min_confidence <= 1:
