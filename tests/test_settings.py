@@ -28,7 +28,6 @@ VARIABLE: dict[tuple[str, str], set[str]] = {
     ("errors.py", "error.setting"): set(),  # of an error that another one takes the place of
     ("outputs/sphere_views.py", "setting"): {"up", "forward", "size_px", "crop"},
     ("pictures/pair_finding.py", "side"): {"left", "right"},
-    ("rendering/comfort.py", "name"): {"strength", "convergence_px"},
     ("rendering/renderer.py", "name"): {"up", "forward"},
     ("stereo.py", "name"): {"focal_px", "baseline_m"},
     ("synth/sets/make.py", "name"): {"pairs", "seed", "frames"},

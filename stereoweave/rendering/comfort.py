@@ -16,15 +16,14 @@ and behind it. Sources:
   moves by more than a pixel from one view of a light-field display to the next is blurred or doubled.
 """
 
-import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from stereoweave.arguments import check_choice, check_kind, check_number
-from stereoweave.errors import StereoweaveError
+from stereoweave.arguments import check_choice, check_kind
+from stereoweave.rendering.renderer import check_convergence_px, check_strength
 from stereoweave.stereo import Estimate
 
 CONFIDENT = 0.5
@@ -170,19 +169,16 @@ def fit_screen(
         convergence_px: Convergence to keep; default: the one that fits.
 
     Raises:
-        StereoweaveError: The screen is unknown, or a number is not finite, or negative for strength.
+        StereoweaveError: The screen is unknown, or a number is out of the range of `Renderer`.
     """
     check_kind("estimate", estimate, Estimate)
-    for name, value, least in (("strength", strength, 0.0), ("convergence_px", convergence_px, -math.inf)):
-        if value is None:
-            continue
-        check_number(name, value)
-        if not (math.isfinite(value) and value >= least):
-            raise StereoweaveError(
-                f"expected a finite number{' of at least 0' if least == 0 else ''}, got {value}", setting=name
-            )
-    choice = ScreenChoice(name=screen, strength=strength, convergence_px=convergence_px)
-    return choice.fit(measure_any_depth(estimate), estimate.disparity_px.shape[1])
+    width_px = estimate.disparity_px.shape[1]
+    choice = ScreenChoice(
+        name=screen,
+        strength=None if strength is None else check_strength(strength),
+        convergence_px=None if convergence_px is None else check_convergence_px(convergence_px, width_px),
+    )
+    return choice.fit(measure_any_depth(estimate), width_px)
 
 
 def measure_depth(estimate: Estimate) -> Depth | None:

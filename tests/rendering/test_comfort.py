@@ -107,10 +107,10 @@ def test_the_python_interface_gives_what_the_renderer_takes():
             {"screen": "cinema"},
             "screen: expected one of phone, television, headset, light_field, found 'cinema'",
         ),
-        ({"screen": "phone", "strength": -1.0}, "strength: expected a finite number of at least 0, got -1.0"),
+        ({"screen": "phone", "strength": -1.0}, "strength: expected 0 or more, got -1.0"),
         (
-            {"screen": "phone", "convergence_px": math.nan},
-            "convergence_px: expected a finite number, got nan",
+            {"screen": "phone", "convergence_px": -21.0},
+            "convergence_px: expected -20 to 20 px (the picture's width), got -21.0",
         ),
     ],
 )
