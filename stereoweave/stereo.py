@@ -134,6 +134,7 @@ class StereoPair:
         for side, image in (("left", self.left), ("right", self.right)):
             if not is_plain_array(image) or image.dtype != np.uint8 or image.shape[2:] != (3,):
                 raise StereoweaveError(f"{side} image: expected uint8 RGB [H, W, 3], got {describe(image)}")
+            _check_not_empty(f"{side} image", image)
             if max(image.shape) > LONGEST_SIDE_PX:
                 raise StereoweaveError(
                     f"{side} image: expected at most {LONGEST_SIDE_PX} pixels per side, got {_size(image)}; "
@@ -199,6 +200,7 @@ class Estimate:
         for note in self.notes:
             check_kind("notes", note, Note)
         check_array("disparity_px", self.disparity_px, "f", 2)
+        _check_not_empty("disparity_px", self.disparity_px)
         shape = self.disparity_px.shape
         for name in ("disparity_px", "right_disparity_px", "confidence", "occluded"):
             value = getattr(self, name)
@@ -212,7 +214,7 @@ class Estimate:
                 raise StereoweaveError(
                     f"{name}: expected finite values, got {count} that are NaN or infinite; fill them first"
                 )
-        if self.confidence.size and not 0 <= self.confidence.min() <= self.confidence.max() <= 1:
+        if not 0 <= self.confidence.min() <= self.confidence.max() <= 1:
             raise StereoweaveError(
                 f"confidence: expected probabilities from 0 to 1, got {self.confidence.min():g} to "
                 f"{self.confidence.max():g}"
@@ -401,6 +403,11 @@ def _refuse(outside: ArrayOrTensor, expected: str) -> None:
             f"{expected}, or NaN where unknown, found {outside[0].item()}; "
             "raise the maximum, or set such pixels to NaN"
         )
+
+
+def _check_not_empty(name: str, image: np.ndarray) -> None:
+    if not image.size:
+        raise StereoweaveError(f"{name}: expected at least one pixel, found {_size(image)}")
 
 
 def _has_same_images(one: StereoPair, other: StereoPair) -> bool:

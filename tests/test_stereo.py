@@ -101,6 +101,21 @@ def test_an_estimate_refuses_disparities_that_are_not_finite():
         make_estimate(right_disparity_px=disparity_px)
 
 
+def test_an_estimate_refuses_maps_of_no_pixels():
+    nothing = np.zeros((0, 5), np.float32)
+    with pytest.raises(StereoweaveError, match="^disparity_px: expected at least one pixel, found 5x0$"):
+        make_estimate(
+            disparity_px=nothing, right_disparity_px=nothing, confidence=nothing, occluded=nothing > 0
+        )
+
+
+@pytest.mark.parametrize(("shape", "size"), [((0, 40, 3), "40x0"), ((32, 0, 3), "0x32")])
+def test_a_pair_refuses_images_of_no_pixels(shape, size):
+    nothing = np.zeros(shape, np.uint8)
+    with pytest.raises(StereoweaveError, match=f"^left image: expected at least one pixel, found {size}$"):
+        StereoPair(left=nothing, right=nothing)
+
+
 @pytest.mark.usefixtures("without_shape_checks")
 def test_an_estimate_refuses_maps_of_two_sizes():
     with pytest.raises(StereoweaveError, match="occluded: expected the shape of disparity_px"):
@@ -126,14 +141,6 @@ def test_an_estimate_is_shown_by_its_size_range_confidence_and_occlusion():
         disparity_px=disparity_px, confidence=np.full((4, 5), 0.756, np.float32), occluded=occluded
     )
     assert repr(found) == "Estimate(5x4, disparity -61.0 to 3.1 px, mean confidence 0.76, 15.0 % occluded)"
-
-
-def test_an_estimate_of_no_pixels_is_shown():
-    nothing = np.zeros((0, 5), np.float32)
-    found = Estimate(
-        disparity_px=nothing, right_disparity_px=nothing, confidence=nothing, occluded=nothing > 0
-    )
-    assert repr(found) == "Estimate(5x0, disparity unknown, mean confidence nan, nan % occluded)"
 
 
 def test_a_view_is_shown_by_its_size_and_the_share_that_is_drawn():

@@ -17,6 +17,7 @@ from stereoweave.cameras.spherical import SphereRequest
 from stereoweave.cameras.unit_check import note_units
 from stereoweave.errors import Note, Remedy, StereoweaveError
 from stereoweave.io.arrays import ImageLike, as_rgb
+from stereoweave.io.images import check_large_enough
 from stereoweave.matching.backend import Backend
 from stereoweave.matching.estimate import match
 from stereoweave.matching.options import MatchOptions
@@ -131,6 +132,7 @@ def _match_images(given: StereoPair, backend: Backend, options: MatchOptions, re
     if chosen:
         eye_size_px = given.left.shape[1], given.left.shape[0]
         given = cut_pair(given, SphereView.chosen(chosen, eye_size_px, request.sphere))
+    check_large_enough("images", given.left)
     if request.rectify is False:
         found = match(matcher, given, options)
         return replace(found, pair=given) if chosen else found

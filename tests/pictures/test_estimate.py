@@ -119,6 +119,14 @@ def test_another_kind_of_alignment_is_refused(example):
         sw.estimate(example.left, example.right, align="always")
 
 
+@pytest.mark.parametrize(("height", "width"), [(1, 1), (3, 3), (40, 1), (31, 64)])
+@pytest.mark.parametrize("align", [None, "auto"])
+def test_an_image_of_less_than_32_pixels_is_refused(height, width, align):
+    image = np.zeros((height, width, 3), np.uint8)
+    with pytest.raises(StereoweaveError, match=rf"^images: expected at least 32x32 .+ {width}x{height}"):
+        sw.estimate(image, image, align=align)
+
+
 def write_rolled_rig(path, roll_degrees):
     """Write a calibration for 160x120 px: 0.1 m apart, the right camera rolled about its optical axis."""
     lens = Optics(matrix=np.array([[150.0, 0, 79.5], [0, 150, 59.5], [0, 0, 1]]), distortion=np.zeros(5))
