@@ -74,7 +74,7 @@ class StereoCamera:
     def depth_m(self, disparity_px: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
         """Return the depth along the optical axis in metres; infinite where disparity_px + doffs_px <= 0."""
         check_numbers("disparity_px", disparity_px)
-        shifted_px = np.maximum(disparity_px + self.doffs_px, 0)
+        shifted_px = np.maximum(_widen(disparity_px) + self.doffs_px, 0)
         with np.errstate(divide="ignore"):
             return self.focal_px * self.baseline_m / shifted_px
 
@@ -82,7 +82,7 @@ class StereoCamera:
         """Return the disparity in pixels for a depth in metres; this is the inverse of `depth_m`."""
         check_numbers("depth_m", depth_m)
         with np.errstate(divide="ignore"):
-            return self.focal_px * self.baseline_m / depth_m - self.doffs_px
+            return self.focal_px * self.baseline_m / _widen(depth_m) - self.doffs_px
 
 
 def scale_camera(camera: StereoCamera, scale_x: float, scale_y: float) -> StereoCamera:
@@ -403,6 +403,12 @@ def _refuse(outside: ArrayOrTensor, expected: str) -> None:
             f"{expected}, or NaN where unknown, found {outside[0].item()}; "
             "raise the maximum, or set such pixels to NaN"
         )
+
+
+def _widen(values: np.ndarray | float) -> np.ndarray:
+    """Return numbers as an array of float32 or wider, because half floats would overflow."""
+    array = np.asanyarray(values)
+    return array.astype(np.result_type(array.dtype, np.float32), copy=False)
 
 
 def _check_not_empty(name: str, image: np.ndarray) -> None:

@@ -36,6 +36,20 @@ def test_depth_is_infinite_where_disparity_and_doffs_are_zero_or_less():
     np.testing.assert_array_equal(depth_m, [[np.inf, np.inf, np.inf]])
 
 
+def test_depth_of_half_floats_does_not_overflow():
+    camera = StereoCamera(**CAMERA | {"focal_px": 1e6})
+    depth_m = camera.depth_m(np.array([[1.0]], np.float16))
+    np.testing.assert_array_equal(depth_m, [[1e5]])  # the greatest half float is 65504
+    np.testing.assert_array_equal(camera.disparity_px(np.array([[1.0]], np.float16)), [[1e5]])
+
+
+@pytest.mark.usefixtures("without_shape_checks")
+def test_single_numbers_are_converted_like_arrays():
+    camera = StereoCamera(**CAMERA, doffs_px=5.0)
+    assert (camera.depth_m(45), camera.depth_m(-5.0)) == (2.0, np.inf)
+    assert (camera.disparity_px(2.0), camera.disparity_px(0.0)) == (45.0, np.inf)
+
+
 def test_the_disparity_of_infinite_depth_is_minus_doffs():
     camera = StereoCamera(**CAMERA, doffs_px=2.0)
     np.testing.assert_array_equal(camera.disparity_px(np.array([[np.inf]])), [[-2.0]])
