@@ -172,7 +172,7 @@ class StereoPair:
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
-    """Matching result for a pair; every array is [H, W] and finite.
+    """Matching result for a pair; every array is [H, W] and finite. Floats of any width become float32.
 
     Attributes:
         disparity_px: Disparity of the left view, float32: column x is at x - disparity_px in the right image.
@@ -205,6 +205,11 @@ class Estimate:
         for name in ("disparity_px", "right_disparity_px", "confidence", "occluded"):
             value = getattr(self, name)
             check_array(name, value, "b" if name == "occluded" else "f", 2)
+            if name != "occluded":
+                # OpenCV and the kernels take no half floats, and Numba compiles again for wider ones.
+                with np.errstate(over="ignore"):
+                    value = value.astype(np.float32, copy=False)
+                object.__setattr__(self, name, value)
             if value.shape != shape:
                 raise StereoweaveError(
                     f"{name}: expected the shape of disparity_px {shape}, got {value.shape}"

@@ -130,6 +130,23 @@ def test_a_pair_refuses_images_of_no_pixels(shape, size):
         StereoPair(left=nothing, right=nothing)
 
 
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
+def test_an_estimate_holds_its_maps_as_float32(dtype):
+    found = make_estimate(
+        disparity_px=np.full((4, 5), 2.5, dtype),
+        right_disparity_px=np.full((4, 5), 2.5, dtype),
+        confidence=np.full((4, 5), 0.5, dtype),
+    )
+    maps = found.disparity_px, found.right_disparity_px, found.confidence
+    assert {each.dtype for each in maps} == {np.dtype(np.float32)}
+    assert [each.max() for each in maps] == [2.5, 2.5, 0.5]
+
+
+def test_an_estimate_refuses_what_float32_cannot_hold():
+    with pytest.raises(StereoweaveError, match="disparity_px: expected finite values, got 20 that"):
+        make_estimate(disparity_px=np.full((4, 5), 1e300))
+
+
 @pytest.mark.usefixtures("without_shape_checks")
 def test_an_estimate_refuses_maps_of_two_sizes():
     with pytest.raises(StereoweaveError, match="occluded: expected the shape of disparity_px"):
