@@ -109,9 +109,9 @@ class StereoMatcher(Settings):
     ) -> Int16[np.ndarray, "h w"]:
         """Return the left image's disparity in 1/16 px; invalid pixels are (minDisparity - 1) * 16.
 
-        A pixel is invalid if it is occluded, if its confidence is below min_confidence, if its disparity
-        is outside minDisparity to minDisparity + numDisparities, if it or its match is outside the region of
-        interest of its image, or if it belongs to a speckle.
+        A pixel is invalid if it is occluded, if its confidence is below min_confidence, if it or its match is
+        outside the region of interest of its image, or if it belongs to a speckle. A disparity outside
+        minDisparity to minDisparity + numDisparities is clipped; by more than 1 px, its confidence is 0.
 
         Args:
             left: Left image of a rectified pair, as returned by cv2.imread: BGR or grey, uint8.
@@ -138,7 +138,6 @@ class StereoMatcher(Settings):
         least_px, most_px = self.getMinDisparity(), self.getMinDisparity() + self.getNumDisparities()
         found = match(self._matcher, pair, MatchOptions(range_px=(least_px, most_px), refined=self._refined))
         known = ~found.occluded & (found.confidence >= self._min_confidence)
-        known &= (found.disparity_px >= least_px) & (found.disparity_px <= most_px)
         if pair.left_seen is not None:
             known &= pair.left_seen
         invalid = (least_px - 1) * _STEPS_PER_PX
