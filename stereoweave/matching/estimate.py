@@ -23,7 +23,7 @@ from stereoweave.matching.matcher import (
     PIXEL_PAIRS_AT_ONCE,
     Matcher,
 )
-from stereoweave.matching.options import DEFAULT_OPTIONS, MatchOptions
+from stereoweave.matching.options import DEFAULT_OPTIONS, OMIT_RANGE, MatchOptions
 from stereoweave.matching.refine import rehearse_refining, right_confidence
 from stereoweave.matching.upsample import enlarge, rehearse_upsampling
 from stereoweave.stereo import LONGEST_SIDE_PX, Estimate, StereoPair
@@ -115,8 +115,9 @@ def _clip_to_width(range_px: tuple[float, float], width_px: int) -> tuple[float,
     if low_px >= width_px or high_px <= -width_px:
         raise StereoweaveError(
             f"expected disparities between {-width_px} and {width_px} px, the width of the pictures, "
-            f"got {low_px:g} and {high_px:g}; omit it for automatic detection",
+            f"got {low_px:g} and {high_px:g}",
             setting="range_px",
+            remedy=OMIT_RANGE,
         )
     return max(low_px, -width_px), min(high_px, width_px)
 

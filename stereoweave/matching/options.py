@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from stereoweave.arguments import as_two_numbers, check_flag
 from stereoweave.errors import Remedy, StereoweaveError
 
+OMIT_RANGE = Remedy("omit it for automatic detection")
+
 
 @dataclass(frozen=True, kw_only=True)
 class MatchOptions:
@@ -46,10 +48,9 @@ DEFAULT_OPTIONS = MatchOptions()
 
 def _parse_range(range_px: tuple[float, float]) -> tuple[float, float]:
     expected = "the least and the greatest disparity in px, such as -20 and 150"
-    omit = Remedy("omit it for automatic detection")
-    low_px, high_px = as_two_numbers("range_px", range_px, expected, omit)
+    low_px, high_px = as_two_numbers("range_px", range_px, expected, OMIT_RANGE)
     if not (math.isfinite(low_px) and math.isfinite(high_px) and low_px < high_px):
         raise StereoweaveError(
-            f"expected {expected}, got {low_px:g} and {high_px:g}", setting="range_px", remedy=omit
+            f"expected {expected}, got {low_px:g} and {high_px:g}", setting="range_px", remedy=OMIT_RANGE
         )
     return low_px, high_px

@@ -136,7 +136,13 @@ class StereoMatcher(Settings):
 
     def _find(self, pair: StereoPair) -> Int16[np.ndarray, "h w"]:
         least_px, most_px = self.getMinDisparity(), self.getMinDisparity() + self.getNumDisparities()
-        found = match(self._matcher, pair, MatchOptions(range_px=(least_px, most_px), refined=self._refined))
+        options = MatchOptions(range_px=(least_px, most_px), refined=self._refined)
+        try:
+            found = match(self._matcher, pair, options)
+        except StereoweaveError as error:
+            if error.setting != "range_px":
+                raise
+            raise StereoweaveError(f"minDisparity, numDisparities: {error.message}") from error
         known = ~found.occluded & (found.confidence >= self._min_confidence)
         if pair.left_seen is not None:
             known &= pair.left_seen

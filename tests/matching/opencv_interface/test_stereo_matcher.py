@@ -96,6 +96,15 @@ def test_converged_cameras_have_disparities_below_0_and_the_mark_below_those():
     assert disparity.min() == -17 * 16
 
 
+def test_a_range_beyond_the_pictures_width_is_named_by_its_own_parameters():
+    with pytest.raises(StereoweaveError) as refused:
+        StereoMatcher(minDisparity=500, numDisparities=192).compute(*moved_pair(12))
+    assert str(refused.value) == (
+        "minDisparity, numDisparities: expected disparities between -160 and 160 px, the width of the "
+        "pictures, got 500 and 692"
+    )
+
+
 def test_grey_pictures_are_taken():
     left, right = (cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY) for picture in moved_pair(12))
     disparity = StereoMatcher(0, 32).compute(left, right)
