@@ -347,6 +347,7 @@ class DepthCurve:
 
     def check(self, values: ArrayOrTensor) -> None:
         """Raise StereoweaveError if a value is outside the range of `encode`."""
+        _require_elements(values)
         if self.max_disparity_px is not None:
             outside = values[(values < 0) | (values > self.max_disparity_px)]
             _refuse(outside, f"disparity: expected 0 to {self.max_disparity_px} px")
@@ -356,6 +357,7 @@ class DepthCurve:
 
     def encode_estimate(self, values: ArrayOrTensor) -> ArrayOrTensor:
         """Encode estimated values; outside the range, extrapolate the curve instead of raising an error."""
+        _require_elements(values)
         if self.max_disparity_px is not None:
             straight = values / self.max_disparity_px
         else:
@@ -368,6 +370,7 @@ class DepthCurve:
         The value and its gradient are finite on all of [0, 1]. A code of 0 is far (disparity 0 or
         max_depth_m), and a code of 1 is near.
         """
+        _require_elements(code)
         straight = code * code.clip(min=_STRAIGHT_BELOW) ** (1 / self.exponent - 1)
         if self.max_disparity_px is not None:
             return straight * self.max_disparity_px
@@ -400,6 +403,11 @@ def fit_exponent(histogram: Real[np.ndarray, " n"]) -> float:
         best = ((edges ** exponents[:, None] - cumulative) ** 2).sum(1).argmin()
         low, high = exponents[max(best - 1, 0)], exponents[min(best + 1, 50)]
     return float(exponents[best])
+
+
+def _require_elements(values: object) -> None:
+    if not hasattr(values, "clip"):
+        raise StereoweaveError(f"expected an array or a tensor, found {describe(values)}")
 
 
 def _refuse(outside: ArrayOrTensor, expected: str) -> None:

@@ -22,6 +22,13 @@ def test_the_code_of_a_disparity_is_its_share_of_the_maximum_raised_to_p():
     np.testing.assert_allclose(curve.encode(np.array([[0.0, 8.0, 50.0, 200.0]])), [[0, 0.008, 0.125, 1]])
 
 
+@pytest.mark.parametrize("values", [50.0, [0.5], None])
+@pytest.mark.parametrize("call", ["encode", "encode_estimate", "decode", "check"])
+def test_what_is_no_array_is_refused(values, call):
+    with pytest.raises(StereoweaveError, match="^expected an array or a tensor, found "):
+        getattr(DepthCurve(max_disparity_px=200.0), call)(values)
+
+
 def test_the_code_of_depth_is_large_where_it_is_near():
     curve = DepthCurve(max_depth_m=15.0, exponent=2.0)
     np.testing.assert_allclose(curve.encode(np.array([[15.0, 7.5, 3.0]])), [[0, 0.25, 0.64]], rtol=1e-12)
