@@ -67,7 +67,7 @@ class StereoCamera:
         cls, image: UInt8[np.ndarray, "h w 3"], *, focal_px: float, baseline_m: float
     ) -> "StereoCamera":
         """Create a camera whose optical axis passes through the centre of the image [H, W, 3]."""
-        check_array("image", image, "u", 3)
+        _check_rgb("image", image)
         height, width = image.shape[:2]
         return cls(focal_px=focal_px, baseline_m=baseline_m, cx_px=(width - 1) / 2, cy_px=(height - 1) / 2)
 
@@ -132,9 +132,7 @@ class StereoPair:
 
     def __post_init__(self) -> None:
         for side, image in (("left", self.left), ("right", self.right)):
-            if not is_plain_array(image) or image.dtype != np.uint8 or image.shape[2:] != (3,):
-                raise StereoweaveError(f"{side} image: expected uint8 RGB [H, W, 3], got {describe(image)}")
-            _check_not_empty(f"{side} image", image)
+            _check_rgb(f"{side} image", image)
             if max(image.shape) > LONGEST_SIDE_PX:
                 raise StereoweaveError(
                     f"{side} image: expected at most {LONGEST_SIDE_PX} pixels per side, got {_size(image)}; "
@@ -426,6 +424,12 @@ def _widen(values: np.ndarray | float) -> np.ndarray:
 
 def _check_not_empty(name: str, image: np.ndarray) -> None:
     if not image.size:
+def _check_rgb(name: str, image: np.ndarray) -> None:
+    if not is_plain_array(image) or image.dtype != np.uint8 or image.shape[2:] != (3,):
+        raise StereoweaveError(f"{name}: expected uint8 RGB [H, W, 3], got {describe(image)}")
+    _check_not_empty(name, image)
+
+
         raise StereoweaveError(f"{name}: expected at least one pixel, found {_size(image)}")
 
 

@@ -76,6 +76,15 @@ def test_a_camera_refuses_nonsense(name, value):
 
 
 @pytest.mark.usefixtures("without_shape_checks")
+def test_an_image_with_the_channels_first_has_no_centre():
+    image = np.zeros((3, 480, 640), np.uint8)
+    with pytest.raises(
+        StereoweaveError, match=r"^image: expected uint8 RGB \[H, W, 3\], got .* \[3, 480, 640\]"
+    ):
+        StereoCamera.centred(image, focal_px=1000.0, baseline_m=0.1)
+
+
+@pytest.mark.usefixtures("without_shape_checks")
 def test_a_pair_refuses_pictures_of_two_sizes():
     with pytest.raises(StereoweaveError, match=r"same size, got 40x32 and 41x32; crop"):
         StereoPair(left=np.zeros((32, 40, 3), np.uint8), right=np.zeros((32, 41, 3), np.uint8))
