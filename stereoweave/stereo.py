@@ -1,5 +1,7 @@
 """Data types that the parts of Stereoweave exchange, and their geometry.
 
+Values that hold arrays are compared by identity, because arrays have no truth value.
+
 Conventions (docs/conventions.md): pixel centres are integers; column x of the left image is at
 x - disparity in the right one; column x of the right image is at x + right disparity in the left.
 """
@@ -116,7 +118,7 @@ def assume_camera(size_px: tuple[int, int], *, doffs_px: float = 0.0) -> StereoC
     )
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class StereoPair:
     """Rectified left and right images, uint8 RGB of the same size, and their camera if known.
 
@@ -168,7 +170,7 @@ class StereoPair:
         )
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Estimate:
     """Matching result for a pair; every array is [H, W] and finite. Floats of any width become float32.
 
@@ -249,7 +251,7 @@ def check_fits(estimate: Estimate, pair: StereoPair) -> None:
         )
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class View:
     """Synthesised image, uint8 RGB [H, W, 3]; `drawn`, bool [H, W], is True at pixels that a camera saw.
 
@@ -263,7 +265,7 @@ class View:
         return _summary(self, self.image, f"{_percent(self.drawn)} drawn")
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Sample:
     """Stereo pair with exact ground truth for training and evaluation; unknown disparity is NaN.
 
@@ -422,14 +424,14 @@ def _widen(values: np.ndarray | float) -> np.ndarray:
     return array.astype(np.result_type(array.dtype, np.float32), copy=False)
 
 
-def _check_not_empty(name: str, image: np.ndarray) -> None:
-    if not image.size:
 def _check_rgb(name: str, image: np.ndarray) -> None:
     if not is_plain_array(image) or image.dtype != np.uint8 or image.shape[2:] != (3,):
         raise StereoweaveError(f"{name}: expected uint8 RGB [H, W, 3], got {describe(image)}")
     _check_not_empty(name, image)
 
 
+def _check_not_empty(name: str, image: np.ndarray) -> None:
+    if not image.size:
         raise StereoweaveError(f"{name}: expected at least one pixel, found {_size(image)}")
 
 

@@ -183,6 +183,18 @@ def test_an_estimate_is_shown_by_its_size_range_confidence_and_occlusion():
     assert repr(found) == "Estimate(5x4, disparity -61.0 to 3.1 px, mean confidence 0.76, 15.0 % occluded)"
 
 
+def test_values_with_arrays_are_equal_to_themselves_alone():
+    def make_values():
+        image, px, mask = np.zeros((4, 5, 3), np.uint8), np.zeros((4, 5), np.float32), np.zeros((4, 5), bool)
+        maps = {"disparity_px": px, "right_disparity_px": px, "occluded": mask}
+        sample = Sample(left=image, right=image, **maps, right_occluded=mask)
+        return [StereoPair(left=image, right=image), make_estimate(), View(image=image, drawn=mask), sample]
+
+    values, others = make_values(), make_values()
+    assert [value in others for value in values] == [False] * 4
+    assert len({*values, *values, *others}) == 8
+
+
 def test_a_view_is_shown_by_its_size_and_the_share_that_is_drawn():
     drawn = np.ones((8, 10), bool)
     drawn[0] = False
