@@ -105,10 +105,10 @@ def _to_eight_bits(values: Shaped[np.ndarray, "..."], name: str) -> UInt8[np.nda
             )
         return (values >> 8).astype(np.uint8)
     if values.dtype.kind != "f":
-        raise StereoweaveError(
-            f"{name}: expected uint8, uint16 or floats in 0..1, got {got}; "
-            "convert values in 0..255 with astype('uint8')"
-        )
+        remedy = "convert values in 0..255 with astype('uint8')"
+        if values.dtype.kind == "b":
+            remedy = "convert black and white with astype('uint8') * 255"
+        raise StereoweaveError(f"{name}: expected uint8, uint16 or floats in 0..1, got {got}; {remedy}")
     # The negated condition also rejects NaN. It precedes the product below, which may overflow.
     if not ((values >= -_FORGIVEN) & (values <= 1 + _FORGIVEN)).all():
         raise StereoweaveError(

@@ -160,7 +160,7 @@ def test_a_path_that_cannot_be_read_is_named_with_the_reason(tmp_path, monkeypat
         (np.zeros(3), ["got [3]"]),
         (np.zeros((40, 50, 3), np.int64), ["int64 [40, 50, 3]", "astype('uint8')"]),
         (np.full((40, 50), 1023, np.uint16), ["uint16 [40, 50] up to 1023", "of 10 bits by 64"]),
-        (np.zeros((40, 50), bool), ["bool [40, 50]", "uint8, uint16 or floats"]),
+        (np.zeros((40, 50), bool), ["bool [40, 50]", "uint8, uint16 or floats", "astype('uint8') * 255"]),
         (torch.full((3, 40, 50), 255.0), ["float32 [3, 40, 50]", "from 255 to 255", "divide"]),
         (np.full((40, 50, 3), -0.1), ["float64", "-0.1", "0..1"]),
         (np.full((40, 50), np.nan), ["nan", "replace NaN"]),
