@@ -361,7 +361,8 @@ def model_file(model: str | Path) -> Path:
     if str(model).endswith(".onnx"):
         path = Path(model)
         if not path.is_file():
-            raise MatcherError(f"{path}: expected an ONNX matcher file, found no such file")
+            found = "a folder" if path.is_dir() else "no such file"
+            raise MatcherError(f"{path}: expected an ONNX matcher file, found {found}")
         return path
     name = MODES[str(model)].network if str(model) in MODES else str(model)
     if name not in shipped_models():

@@ -67,6 +67,12 @@ def test_a_failure_to_load_is_a_one_line_error(fields, kind, message):
     assert "\n" not in str(caught.value)
 
 
+def test_a_folder_is_no_matcher_file(tmp_path):
+    (tmp_path / "folder.onnx").mkdir()
+    with pytest.raises(MatcherError, match=r"folder\.onnx: expected an ONNX matcher file, found a folder$"):
+        Backend(model=tmp_path / "folder.onnx").matcher()
+
+
 def test_a_failed_load_is_tried_again(tmp_path):
     file = tmp_path / "matcher.onnx"
     with pytest.raises(MatcherError):
