@@ -4,6 +4,7 @@ import math
 import os
 import re
 from collections.abc import Mapping
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from stereoweave.arguments import check_array, check_kind
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io.decoding import check_regular, check_size, decode_values, open_picture
 from stereoweave.io.files import reading, replacing
-from stereoweave.io.images import checking_format_size, save_picture
+from stereoweave.io.images import save_encoded, save_picture
 
 # The number of digits is limited, because Python cannot print an integer of 4,301 digits.
 _PFM_HEADER = re.compile(rb"Pf\s+(\d{1,9})\s+(\d{1,9})\s+(\S{1,99})\s")
@@ -76,22 +77,22 @@ def _parse_pfm_header(path: str | Path, content: bytes) -> tuple[tuple[int, int]
 def write_pfm(path: str | Path, values: Float[np.ndarray, "h w"]) -> None:
     """Write a single-channel PFM file in little-endian float32; NaN and infinity are kept."""
     _check_map(path, "values", values)
-    with replacing(path) as temporary:
-        Image.fromarray(values.astype(np.float32)).save(temporary, "PPM")
+    save_encoded(path, Image.fromarray(values.astype(np.float32)), "PPM")
 
 
 def write_float_tiff(path: str | Path, values: Float[np.ndarray, "h w"]) -> None:
     """Write a single-channel TIFF file in float32, uncompressed; NaN and infinity are kept."""
     _check_map(path, "values", values)
-    with replacing(path) as temporary, checking_format_size(path, values.shape):
-        Image.fromarray(values.astype(np.float32)).save(temporary, "TIFF")
+    save_encoded(path, Image.fromarray(values.astype(np.float32)), "TIFF")
 
 
 def write_npy(path: str | Path, values: Float[np.ndarray, "h w"]) -> None:
     """Write a NumPy .npy file in float32; NaN and infinity are kept."""
     _check_map(path, "values", values)
+    content = BytesIO()  # of a full disk, NumPy would only say how much it wrote
+    np.save(content, values.astype(np.float32), allow_pickle=False)
     with replacing(path) as temporary:
-        np.save(temporary, values.astype(np.float32), allow_pickle=False)
+        temporary.write_bytes(content.getbuffer())
 
 
 def _check_map(path: object, name: str, values: object) -> None:

@@ -20,8 +20,7 @@ from stereoweave.arguments import check_choice
 from stereoweave.errors import Remedy, StereoweaveError
 from stereoweave.io.animation import check_animation_ending
 from stereoweave.io.colormap import find_colour_range_px
-from stereoweave.io.files import replacing
-from stereoweave.io.images import checking_format_size, picture_kind, write_image
+from stereoweave.io.images import picture_kind, save_encoded, write_image
 from stereoweave.io.spatial_photos import write_spatial_photo
 from stereoweave.io.vr180_photos import is_vr180_name
 from stereoweave.rendering.floating_windows import cut_windows
@@ -376,12 +375,11 @@ def write_picture(
         left, right = np.split(picture, 2, axis=1)
         write_spatial_photo(Path(path), left, right, camera)
         return
-    with replacing(path) as temporary, checking_format_size(path, picture.shape):
-        if ending == ".jps":
-            Image.fromarray(picture).save(temporary, "JPEG", extra=_JPS_SEGMENT, **_FINE)
-        else:
-            first, second = (Image.fromarray(half) for half in np.split(picture, 2, axis=1))
-            first.save(temporary, "MPO", save_all=True, append_images=[second], **_FINE)
+    if ending == ".jps":
+        save_encoded(path, Image.fromarray(picture), "JPEG", extra=_JPS_SEGMENT, **_FINE)
+        return
+    first, second = (Image.fromarray(half) for half in np.split(picture, 2, axis=1))
+    save_encoded(path, first, "MPO", save_all=True, append_images=[second], **_FINE)
 
 
 def describe_picture(path: str | Path, name: str, picture: UInt8[np.ndarray, "h w 3"]) -> str:

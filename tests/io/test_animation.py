@@ -1,12 +1,12 @@
 """Animations are read back as they were written; failed ones leave nothing behind."""
 
-import resource
 import sys
 import weakref
 
 import av
 import numpy as np
 import pytest
+from full_disks import disk_with_room
 from PIL import Image, ImageSequence
 
 from stereoweave.errors import StereoweaveError
@@ -154,13 +154,11 @@ def test_an_error_halfway_keeps_the_earlier_file(tmp_path, moving, ending):
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_a_full_disk_is_a_one_line_error_and_leaves_no_file(tmp_path, rng, ending):
     noise = rng.integers(0, 256, (4, 128, 128, 3), dtype=np.uint8)
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
-    try:
-        with pytest.raises(StereoweaveError, match=f"a{ending}: expected a writable file") as told:
-            write_animation(tmp_path / f"a{ending}", noise, 40)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    with (
+        pytest.raises(StereoweaveError, match=f"a{ending}: expected a writable file") as told,
+        disk_with_room(4096),
+    ):
+        write_animation(tmp_path / f"a{ending}", noise, 40)
     assert len(str(told.value).splitlines()) == 1
     assert list(tmp_path.iterdir()) == []
 

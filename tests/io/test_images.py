@@ -4,6 +4,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from full_disks import disk_with_room
 from picture_examples import refusal_of
 from PIL import Image
 
@@ -197,6 +198,17 @@ def test_an_unknown_ending_is_refused(tmp_path, picture, name):
     message = refusal_of(images.write_image, tmp_path / name, picture, kind=StereoweaveError)
     assert f"found {Path(name).suffix or 'none'}" in message
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("ending", [".png", ".jpg", ".tif", ".webp", ".bmp"])
+def test_a_picture_that_a_full_disk_cuts_off_is_an_error_and_keeps_the_earlier_file(tmp_path, rng, ending):
+    path = tmp_path / f"picture{ending}"
+    images.write_image(path, rng.integers(0, 256, (40, 48, 3), dtype=np.uint8))
+    earlier = path.read_bytes()
+    with disk_with_room(len(earlier) // 2):
+        found = refusal_of(images.write_image, path, images.read_image(path), kind=StereoweaveError)
+    assert found == f"{path}: expected a writable file, found file too large"
+    assert [file.read_bytes() for file in tmp_path.iterdir()] == [earlier]
 
 
 # Pairs

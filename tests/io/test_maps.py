@@ -3,9 +3,11 @@ import struct
 import cv2
 import numpy as np
 import pytest
+from full_disks import disk_with_room
 from picture_examples import refusal_of
 from PIL import Image
 
+from stereoweave.errors import StereoweaveError
 from stereoweave.io import images, maps
 
 
@@ -157,6 +159,15 @@ def test_a_depth_png_holds_millimetres_and_unknown_as_0(tmp_path):
     depth_m = np.array([[1.0, 2.3456, 65.535], [65.536, np.inf, np.nan]])
     maps.write_depth_png(tmp_path / "depth.png", depth_m)
     np.testing.assert_array_equal(stored(tmp_path / "depth.png"), [[1000, 2346, 65535], [0, 0, 0]])
+
+
+@pytest.mark.parametrize("write", [maps.write_pfm, maps.write_float_tiff, maps.write_npy])
+def test_a_map_that_a_full_disk_cuts_off_is_an_error_and_leaves_no_file(tmp_path, write):
+    path = tmp_path / "disparity"
+    with disk_with_room(4000):  # for 1000 values of 4 bytes, and no header
+        found = refusal_of(write, path, np.ones((25, 40)), kind=StereoweaveError)
+    assert found == f"{path}: expected a writable file, found file too large"
+    assert list(tmp_path.iterdir()) == []
 
 
 # Stored values of pictures

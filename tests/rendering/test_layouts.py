@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from full_disks import disk_with_room
 from PIL import Image
 
 from stereoweave.errors import StereoweaveError
@@ -322,6 +323,20 @@ def test_a_jps_file_is_a_jpeg_whose_header_gives_the_layout(tmp_path, wall):
     # By ExifTool's table: flags without "left field first", layout 2 side by side, type 1 stereo.
     assert segments["APP3"][:8] == b"_JPSJPS_"
     assert list(segments["APP3"][10:14]) == [0, 0, 2, 1]
+
+
+@pytest.mark.parametrize(("ending", "layout"), [(".mpo", "side_by_side"), (".jps", "crossed")])
+def test_a_stereo_picture_that_a_full_disk_cuts_off_is_an_error(tmp_path, wall, ending, layout):
+    path, picture = tmp_path / f"view{ending}", composed(layout, wall)
+    write_picture(path, picture)
+    with (
+        disk_with_room(path.stat().st_size - 1),
+        pytest.raises(StereoweaveError, match=f"^{path}: expected a writable file, found file too large$"),
+    ):
+        write_picture(path, picture)
+    with Image.open(path) as file:
+        file.seek(file.n_frames - 1 if ending == ".mpo" else 0)
+        file.load()
 
 
 def test_other_endings_are_ordinary_pictures(tmp_path, wall):

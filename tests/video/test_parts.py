@@ -1,11 +1,11 @@
 """Parts of an unfinished video: kept after an error, continued with the same settings, then removed."""
 
 import json
-import resource
 from pathlib import Path
 
 import numpy as np
 import pytest
+from full_disks import disk_with_room
 
 from stereoweave.errors import StereoweaveError
 from stereoweave.video.parts import Parts, open_parts, parts_folder
@@ -104,15 +104,13 @@ def test_the_remedy_for_parts_without_settings_is_to_remove_their_folder(tmp_pat
 
 
 def test_a_disk_that_is_full_from_the_start_is_reported_in_one_line_with_the_file(tmp_path):
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     told = r"settings\.json: expected a writable file, found file too large$"
-    with pytest.raises(StereoweaveError, match=told):
-        resource.setrlimit(resource.RLIMIT_FSIZE, (1, hard))
-        try:
-            with open_parts(tmp_path / "video.mp4", {"position": 0.5}):
-                pass
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    with (
+        pytest.raises(StereoweaveError, match=told),
+        disk_with_room(1),
+        open_parts(tmp_path / "video.mp4", {"position": 0.5}),
+    ):
+        pass
     assert list(tmp_path.iterdir()) == []
 
 
