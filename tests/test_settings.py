@@ -21,6 +21,9 @@ PACKAGE = Path(sw.__file__).parent
 TESTS = Path(__file__).parent
 # Settings that no constant names, by module and expression.
 VARIABLE: dict[tuple[str, str], set[str]] = {
+    ("batch/worker.py", "given"): {
+        *("calibration", "focal_px", "baseline_m", "range_px", "refined", "raw", "files"),
+    },
     ("cameras/spherical.py", "given[0]"): {"whole", "look_deg", "fov_deg", "lens_fov_deg"},
     ("arguments.py", "setting"): {"range_px", "look_deg"},
     ("cameras/spherical.py", "setting"): {"look_deg", "fov_deg"},

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from stereoweave.batch.manifest import PlanEntry, read_chunk, read_rows, write_rows
-from stereoweave.errors import OutputInUseError, ProviderError, StereoweaveError, format_error
+from stereoweave.errors import Note, OutputInUseError, ProviderError, Remedy, StereoweaveError, format_error
 from stereoweave.io.files import is_leftover
 from stereoweave.io.images import SMALLEST_SIDE_PX
 from stereoweave.io.stores import Store
@@ -224,7 +224,12 @@ class ChunkWorker:
             from stereoweave.video.reader import open_video
 
         films, _ = self._fetch(entry, scratch / "pictures")
-        film_job = VideoJob(depth16=True, backend=job.backend, name_of=job.name_of)
+        film_job = VideoJob(
+            depth16=True,
+            rectify=job.request.rectify is not False,
+            backend=job.backend,
+            name_of=job.name_of,
+        )
         video = open_video(films, job.request.format, sphere=job.request.sphere)
         with self._open_results(entry, scratch) as out:
             make = partial(convert_video, video, films, out / FILM, film_job, Console(quiet=True))
@@ -241,7 +246,12 @@ class ChunkWorker:
                 shutil.rmtree(begun, ignore_errors=True)
                 tally = make()
         width, height = video.size_px
-        return {"width_px": width, "height_px": height, "checks": tally.named, "files": _list_names(out)}
+        checks = [
+            *(note.format(job.name_of) for note in _note_unused_settings(job)),
+            *tally.notes,
+            *tally.named,
+        ]
+        return {"width_px": width, "height_px": height, "checks": checks, "files": _list_names(out)}
 
     def _fetch(self, entry: PlanEntry, into: Path) -> tuple[tuple[Path, ...], Path | None]:
         """Copy the files and the calibration to this machine, and return their paths."""
@@ -295,6 +305,23 @@ class ChunkWorker:
     def __getstate__(self) -> dict[str, Any]:
         """Return the state without the loaded job, because networks cannot be pickled."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
+
+
+def _note_unused_settings(job: DepthJob) -> list[Note]:
+    """Return a list with a note on the settings that are for pairs only, if any are given."""
+    for_pairs = {
+        "calibration": job.request.calibration is not None,
+        "focal_px": job.request.focal_px is not None,
+        "baseline_m": job.request.baseline_m is not None,
+        "range_px": job.options.range_px is not None,
+        "refined": job.options.refined,
+        "raw": job.options.raw,
+        "files": bool(job.files),
+    }
+    given = tuple(setting for setting, is_given in for_pairs.items() if is_given)
+    if not given:
+        return []
+    return [Note("some settings apply to pairs only, not to this video", Remedy("leave them out", given))]
 
 
 class _StoreError(StereoweaveError):

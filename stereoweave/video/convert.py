@@ -63,7 +63,7 @@ def convert_video(
         console: Console for notes on the video and for progress.
 
     Returns:
-        Counts for the whole conversion, including interrupted runs.
+        Counts and notes for the whole conversion, including interrupted runs.
 
     Raises:
         StereoweaveError: `out` has an unsuitable extension, is in use, or cannot be written to, for example
@@ -91,8 +91,9 @@ def convert_video(
                 video, matcher, bar, rectified=job.rectify, threads=job.backend.threads
             )
             converter = FrameConverter(job, survey, video.size_px)
-            for note in [*notes, *find_losses(job, survey)]:
-                _print_line(console, note.format(job.name_of))
+            converter.tally.notes = [note.format(job.name_of) for note in [*notes, *find_losses(job, survey)]]
+            for line in converter.tally.notes:
+                _print_line(console, line)
         frames = video.frames(converter.tally.frames)
         opening = list(islice(frames, 1))  # may decode frames before it, which is no part of the speed
         meter = _Meter(bar, out.name, video, converter.tally.frames)

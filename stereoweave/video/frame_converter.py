@@ -41,14 +41,16 @@ Item = TypeVar("Item")
 class VideoTally:
     """Counts of frames, cuts and frames with problems so far, and descriptions of the first problems.
 
-    `frames_per_s` is the speed of the conversion since it was last started; 0 while it runs. `comfort` says
-    how the depth was fitted to the job's screen; it is set at the end, and by `FrameConverter.from_state`.
+    `notes` are the notes on the whole video. `frames_per_s` is the speed of the conversion since it was last
+    started; 0 while it runs. `comfort` says how the depth was fitted to the job's screen; it is set at the
+    end, and by `FrameConverter.from_state`.
     """
 
     frames: int = 0
     cuts: int = 0
     problems: int = 0
     named: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
     frames_per_s: float = 0.0
     comfort: str = ""
 
@@ -102,7 +104,9 @@ class FrameConverter:
         )
         converter = cls(job, survey, size_px)
         frames, cuts, problems = state.pop("tally").tolist()
-        converter.tally = VideoTally(frames, cuts, problems, state.pop("named").tolist())
+        converter.tally = VideoTally(
+            frames, cuts, problems, state.pop("named").tolist(), state.pop("notes").tolist()
+        )
         converter._filter = TemporalFilter.from_state(state, job.backend.threads)
         converter._grouper = FrameGrouper.from_state(state)
         screen = converter._squeezed.job.screen
@@ -121,6 +125,7 @@ class FrameConverter:
             ),
             "tally": np.array([tally.frames, tally.cuts, tally.problems]),
             "named": np.array(tally.named, dtype=np.str_),
+            "notes": np.array(tally.notes, dtype=np.str_),
             **self._filter.state(),
             **self._grouper.state(),
             **(self._comfort.state() if self._comfort else {}),

@@ -33,6 +33,7 @@ from stereoweave.io.output_lock import lock_output
 from stereoweave.io.stores import store_at
 from stereoweave.matching.backend import Backend, _load
 from stereoweave.matching.matcher import Matcher, model_file
+from stereoweave.matching.options import MatchOptions
 from stereoweave.outputs.results import DepthJob, make_depth
 from stereoweave.pictures.prepare import Request
 from stereoweave.system.ray_engine import Engine, connect
@@ -380,6 +381,34 @@ def test_a_video_is_processed_by_the_projection_that_is_given(tmp_path):
     [row] = read_rows(out, chunk).values()
     # 160 px over 180 degrees are 50.9 px a radian; of 60 degrees, 2 * 50.9 * tan(30 degrees) = 58.8.
     assert (row["files"], row["error"], row["width_px"]) == ([FILM], None, 58)
+
+
+def checks_of_video(folder: Path, job: DepthJob) -> list[str]:
+    """Return the checks in the row of a video whose sides are swapped if it is read as `side_by_side`."""
+    (folder / "films").mkdir()
+    write_side_by_side(folder / "films" / "sea.mkv", example_pairs(3), layout="crossed")
+    source, out = store_at(folder / "films"), store_at(folder / "out")
+    [chunk] = extend_plan(source, out, workers=1).chunks
+    assert ChunkWorker(source, out, job)([chunk]).made == 1
+    [row] = read_rows(out, chunk).values()
+    return row["checks"]
+
+
+@pytest.mark.parametrize(
+    ("rectify", "told"),
+    [(None, "left and right were swapped"), (False, "left and right are swapped; choose crossed (format)")],
+)
+def test_a_video_is_rectified_unless_refused_and_the_row_has_its_notes(tmp_path, rectify, told):
+    job = replace(JOB, request=Request(format="side_by_side", rectify=rectify))
+    assert told in " ".join(checks_of_video(tmp_path, job))
+
+
+def test_the_row_of_a_video_names_the_settings_that_apply_to_pairs_only(tmp_path):
+    request = Request(format="crossed", focal_px=700.0, baseline_m=0.1)
+    job = DepthJob(request=request, options=MatchOptions(raw=True, range_px=(0, 64)), files=("depth.png",))
+    told = "some settings apply to pairs only, not to this video; leave them out"
+    names = "(focal_px, baseline_m, range_px, raw, files)"
+    assert f"{told} {names}" in checks_of_video(tmp_path, job)
 
 
 def test_a_spatial_video_is_processed(tmp_path):
