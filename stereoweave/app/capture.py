@@ -15,6 +15,7 @@ from stereoweave.app.apart_capture import ApartCapture
 from stereoweave.errors import FormatError, Note, StereoweaveError
 from stereoweave.pictures.pair_layouts import Picture
 from stereoweave.stereo import StereoCamera
+from stereoweave.video.tracks import read_declared_packing
 
 _DEFAULT_RATE = 25.0
 # A network stream may be slow; a camera that delivers no frame for this long is disconnected.
@@ -51,6 +52,7 @@ class Capture:
         count: Number of images of each moment.
         is_spatial: Whether the source is a spatial video.
         camera: Camera of the views, if a spatial video declares it.
+        declared_packing: Frame packing that a video file with both views in each frame declares, if any.
         notes: Notes on the source.
 
     Raises:
@@ -71,6 +73,7 @@ class Capture:
         apart = [capture for capture in self._captures if isinstance(capture, ApartCapture)]
         self.is_spatial = any(capture.packing is None for capture in apart)
         self.camera: StereoCamera | None = None
+        self.declared_packing: str | None = None
         self.notes: Sequence[Note] = ()
         if isinstance(first, ApartCapture) and len(sources) == 1:
             self.count, self.camera, self.notes = 2, first.camera, first.notes
@@ -80,6 +83,8 @@ class Capture:
                 f"{self.name}: expected a left and a right video with one view each, found a {kind} with "
                 "both views; give it alone"
             )
+        elif Path(sources[0]).is_file():
+            self.declared_packing = read_declared_packing(Path(sources[0]))
         # A single picture or a recorded stream has no frame count.
         self._is_recording = _count_frames(first) > 0 or Path(sources[0]).is_file()
         self._loop = loop and self._is_recording

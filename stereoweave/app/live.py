@@ -83,7 +83,8 @@ def show(  # noqa: PLR0913 - source, output and settings
         screen: Web page that shows the images.
         matcher: Matcher that estimates the disparity.
         tally: Statistics, updated with each frame so that they are valid even after an error.
-        format: Frame packing of a single source, a name in `FRAME_PACKINGS`. Default: detected.
+        format: Frame packing of a single source, a name in `FRAME_PACKINGS`. Default: as the
+            file declares, else detected.
         rig: Calibration with which to rectify the images. Default: the images are already rectified, by the
             camera that a spatial video declares.
         tell: Function that is called with each note on the sources and the calibration, at the first frame.
@@ -98,7 +99,7 @@ def show(  # noqa: PLR0913 - source, output and settings
     range_px: tuple[float, float] | None = None
     while moment := capture.newest(tally.last):
         if capture.count == 1 and format is None:
-            format = detect_layout(capture.name, moment.pictures)
+            format = detect_layout(capture.name, moment.pictures, capture.declared_packing)
         split = _split_pair(moment.pictures, format)
         ready = rectify(split, rig) if rig else Rectified(pair=replace(split, camera=capture.camera))
         pair = ready.pair

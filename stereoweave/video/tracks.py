@@ -95,7 +95,7 @@ class VideoTrack:
         self.is_spatial = codec == "hevc" and is_spatial(first)
         declared = read_stereo3d(first) or Stereo3D()
         self._right_first = declared.is_right_first
-        self.declared_packing = None if self.is_spatial else _name_packing(declared)
+        self.declared_packing = None if self.is_spatial else _find_packing(first)
         # The file does not say whether field of view and baseline are meant before or after a rotation.
         has_camera = self.is_spatial and first.rotation % 360 == 0
         self.camera = declared.camera(self._frame_size_px) if has_camera else None
@@ -250,13 +250,27 @@ def shows_one_view(path: Path, *, spatial_only: bool = False) -> bool:
 
     False for a file that cannot be decoded.
     """
+    first, codec = _read_first_frame(path)
+    if first is not None and codec == "hevc" and is_spatial(first):
+        return True
+    return not spatial_only and _find_packing(first) in FRAME_SEQUENTIAL
+
+
+def read_declared_packing(path: Path) -> str | None:
+    """Return the `declared_packing` of an ordinary video file; None for a file that cannot be decoded."""
+    return _find_packing(_read_first_frame(path)[0])
+
+
+def _read_first_frame(path: Path) -> "tuple[av.VideoFrame | None, str]":
+    """Return the first frame that can be decoded, if any, and the name of its codec."""
     with suppress(StereoweaveError), open_stream(path) as (container, stream):
-        first = next(drop_corrupt(decode(container, stream)), None)
-        if first is not None and stream.codec_context.name == "hevc" and is_spatial(first):
-            return True
-        declared = None if spatial_only or first is None else read_stereo3d(first)
-        return declared is not None and _name_packing(declared) in FRAME_SEQUENTIAL
-    return False
+        return next(drop_corrupt(decode(container, stream)), None), stream.codec_context.name
+    return None, ""
+
+
+def _find_packing(first: "av.VideoFrame | None") -> str | None:
+    declared = None if first is None else read_stereo3d(first)
+    return _name_packing(declared) if declared else None
 
 
 def _convert_all(views: Sequence["av.VideoFrame"]) -> list[UInt8[np.ndarray, "h w 3"]]:

@@ -465,6 +465,15 @@ def test_frames_in_turn_are_shown_as_pairs(tmp_path, monkeypatch):
     assert "frame_sequential, as the file declares" in told
 
 
+def test_the_frame_packing_that_a_file_declares_is_taken(tmp_path, monkeypatch):
+    pairs = example_pairs(2)
+    crossed = video_examples.write_side_by_side(
+        tmp_path / "a.mkv", pairs, layout="crossed", codec="libx264", stereo_mode="right_left"
+    )
+    pair, _, _ = last_pair(monkeypatch, crossed)
+    assert_views(pair, *pairs[-1])
+
+
 def test_views_apart_are_read_from_a_single_file_only(tmp_path):
     with pytest.raises(
         FormatError, match="^0: expected a video file .* two_streams, found another"
