@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from stereoweave import __version__
-from stereoweave.errors import Remedy, StereoweaveError
+from stereoweave.errors import Note, Remedy, StereoweaveError
 from stereoweave.io.files import refuse_inputs
 from stereoweave.io.output_lock import lock_output
 from stereoweave.matching.edge_vote.vote import rehearse_voting
@@ -91,7 +91,8 @@ def convert_video(
                 video, matcher, bar, rectified=job.rectify, threads=job.backend.threads
             )
             converter = FrameConverter(job, survey, video.size_px)
-            converter.tally.notes = [note.format(job.name_of) for note in [*notes, *find_losses(job, survey)]]
+            notes += [*_note_aspect(job, video, out), *find_losses(job, survey)]
+            converter.tally.notes = [note.format(job.name_of) for note in notes]
             for line in converter.tally.notes:
                 _print_line(console, line)
         frames = video.frames(converter.tally.frames)
@@ -115,8 +116,20 @@ def _make_recorder(job: VideoJob, video: StereoVideo) -> Recorder:
         rate=video.rate.limit_denominator(100_000),
         packing=PACKED[job.layout].declared if job.layout in PACKED else None,
         colours=Colours(*video.hdr_colours) if job.is_fine and video.hdr_colours else BT709,
+        pixel_aspect=video.pixel_aspect,
         threads=thread_count(job.backend.threads),
     )
+
+
+def _note_aspect(job: VideoJob, video: StereoVideo, out: Path) -> list[Note]:
+    """Return a list with a note if players will show the output as if its pixels were square."""
+    if video.pixel_aspect == 1 or out.suffix.lower() != ".mkv" or job.layout not in PACKED:
+        return []
+    text = (
+        f"the video has pixels {float(video.pixel_aspect):.3g} times as wide as high, which FFmpeg cannot "
+        "write beside a frame packing in .mkv"
+    )
+    return [Note(text, Remedy("write .mp4 instead"))]
 
 
 def _choose_encoding(job: VideoJob) -> Encoding:

@@ -28,6 +28,7 @@ class PictureTrack:
         FormatError: No picture in `files` can be read.
     """
 
+    pixel_aspect = Fraction(1)
     declared_packing: str | None = None
     is_spatial = False
     camera: StereoCamera | None = None

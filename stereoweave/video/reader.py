@@ -16,7 +16,8 @@ from stereoweave.arguments import check_choice
 from stereoweave.cameras.sphere_remap import Cutter
 from stereoweave.cameras.spherical import SphereRequest
 from stereoweave.errors import FormatError, Note, Remedy, StereoweaveError
-from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS, detect_layout
+from stereoweave.pictures.interleaved import InterleavedLayout
+from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS, PairLayout, detect_layout
 from stereoweave.pictures.panoramas import SphereView, choose_layout, guess_projection
 from stereoweave.video.frame_sequence import FrameSequence
 from stereoweave.video.mvc import check_not_mvc
@@ -74,6 +75,7 @@ class StereoVideo:
         name: Paths of the files, as given by the caller.
         frame_packing: Frame packing, a name in `FRAME_PACKINGS`; None for two files, and for a spatial video.
         size_px: Width and height of each eye's image at full size.
+        pixel_aspect: Width of a pixel of this image divided by its height.
         frame_count: Number of frames that `frames` yields, including damaged frames. For two files with
             different numbers of frames, this is the lower number.
         rate: Average frames per second.
@@ -104,6 +106,7 @@ class StereoVideo:
         self.name = ", ".join(track.name for track in tracks)
         self.frame_packing = frame_packing
         self.size_px = self._split.eye_size_px(*first.size_px) if self._split else first.size_px
+        self.pixel_aspect = _find_pixel_aspect(self._split, first.pixel_aspect)
         odd = self._split.note_odd_size(*first.size_px) if self._split else []
         self.notes = (*notes, *first.notes, *odd)
         self.camera = first.camera
@@ -131,7 +134,7 @@ class StereoVideo:
         """Return the same video with windows of its VR180 or 360-degree frames as frames."""
         shown = copy.copy(self)
         shown.sphere, shown._cutter = view, view.cutter()
-        shown.size_px = view.window.size_px
+        shown.size_px, shown.pixel_aspect = view.window.size_px, Fraction(1)
         shown.baseline_m = baseline_m
         shown.camera = None if baseline_m is None else view.window.camera(baseline_m)
         shown.notes = (*self.notes, note)
@@ -306,6 +309,13 @@ def check_unpacked(name: str, format: str | None) -> None:
             f"layers, found {format}",
             remedy=Remedy("leave it out", ("format",)),
         )
+
+
+def _find_pixel_aspect(split: PairLayout | InterleavedLayout | None, stated: Fraction) -> Fraction:
+    """Return the pixel aspect of views at full size; some files state that of the squeezed views."""
+    if isinstance(split, PairLayout) and split.half and stated == (2 if split.beside else Fraction(1, 2)):
+        return Fraction(1)
+    return stated
 
 
 def _note_kept(note: Note) -> Note:

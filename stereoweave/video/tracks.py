@@ -59,6 +59,7 @@ class VideoTrack:
         time_base: Time unit in seconds.
         rate: Average frames per second.
         size_px: Width and height of a whole frame after the rotation that players apply.
+        pixel_aspect: Width of a pixel divided by its height, after that rotation; 1 if unknown.
         declared_packing: Frame packing declared in the file, a packing in `PAIR_LAYOUTS` other than of half
             size, or an unsupported packing; None if the file declares no packing, or is a spatial video.
         is_spatial: Whether the video is a spatial one (MV-HEVC), with each view in a layer of its own.
@@ -83,16 +84,18 @@ class VideoTrack:
             first = next(drop_corrupt(decode(container, stream)), None)
             if first is None:
                 raise FormatError(f"{self.name}: expected a video, found a file without a decodable frame")
-            self._describe(first, stream.codec_context.name)
+            self._describe(first, stream)
 
     def _opening(self) -> AbstractContextManager[tuple["av.container.InputContainer", "av.VideoStream"]]:
         return open_stream(self._path, self._index)
 
-    def _describe(self, first: "av.VideoFrame", codec: str) -> None:
+    def _describe(self, first: "av.VideoFrame", stream: "av.VideoStream") -> None:
         """Set what the first frame says about all frames."""
         self._frame_size_px = first.width, first.height
-        self.size_px = self._frame_size_px if first.rotation % 180 == 0 else self._frame_size_px[::-1]
-        self.is_spatial = codec == "hevc" and is_spatial(first)
+        self.size_px, self.pixel_aspect = self._frame_size_px, stream.sample_aspect_ratio or Fraction(1)
+        if first.rotation % 180:
+            self.size_px, self.pixel_aspect = self._frame_size_px[::-1], 1 / self.pixel_aspect
+        self.is_spatial = stream.codec_context.name == "hevc" and is_spatial(first)
         declared = read_stereo3d(first) or Stereo3D()
         self._right_first = declared.is_right_first
         self.declared_packing = None if self.is_spatial else _find_packing(first)

@@ -114,6 +114,7 @@ class Recorder:
         rate: Frames per second; sets the duration of the last frame.
         packing: Frame packing to declare in the file, if any. HEVC itself cannot.
         colours: Meaning of the colours.
+        pixel_aspect: Width of a pixel divided by its height. FFV1 cannot say it.
         threads: Number of encoder threads.
     """
 
@@ -122,6 +123,7 @@ class Recorder:
     rate: Fraction
     packing: Packing | None = None
     colours: Colours = BT709
+    pixel_aspect: Fraction = Fraction(1)
     threads: int = 1
 
     def write_part(self, path: Path, pictures: Iterable[tuple[Fraction, Picture]]) -> None:
@@ -221,6 +223,8 @@ class Recorder:
         assert isinstance(stream, VideoStream)
         stream.width, stream.height, stream.pix_fmt = frame.width, frame.height, self.encoding.pixel_format
         stream.thread_count = self.threads
+        if self.pixel_aspect != 1:
+            stream.codec_context.sample_aspect_ratio = self.pixel_aspect
         stream.color_range, stream.colorspace = self.encoding.colour_range, self.colours.matrix
         stream.color_primaries, stream.color_trc = self.colours.primaries, self.colours.transfer
         return stream

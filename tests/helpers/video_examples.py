@@ -107,6 +107,7 @@ def write_video(
     color_range: int = 0,
     stereo_mode: str | None = None,
     rotation: int = 0,
+    pixel_aspect: Fraction | None = None,
     options: dict[str, str] | None = None,
 ) -> Path:
     """Write a video of RGB frames, optionally with sound.
@@ -122,6 +123,7 @@ def write_video(
         color_range: 0 unspecified, 1 limited, 2 full.
         stereo_mode: Matroska's frame packing tag, such as "left_right".
         rotation: Anticlockwise rotation in degrees that players must apply.
+        pixel_aspect: Width of a pixel divided by its height.
         options: Encoder options, such as {"g": "12"} for a key frame every 12 frames.
     """
     times_ms = times_ms if times_ms is not None else [FRAME_MS * index for index in range(len(frames))]
@@ -136,6 +138,8 @@ def write_video(
         stream.codec_context.options = {**_GOOD.get(codec, {}), **(options or {})}
         if stereo_mode:
             stream.metadata["stereo_mode"] = stereo_mode
+        if pixel_aspect:
+            stream.codec_context.sample_aspect_ratio = pixel_aspect
         if rotation:
             stream.set_display_rotation(rotation)
         track = container.add_stream("aac", rate=SOUND_RATE) if sound else None

@@ -21,6 +21,7 @@ from video_examples import (
     TEXTURED,
     damage,
     example_pairs,
+    packed,
     packets,
     write_side_by_side,
     write_video,
@@ -69,6 +70,43 @@ def test_a_conversion_keeps_uneven_frame_times_and_the_sound(tmp_path, capsys):
     assert times_of(tmp_path / "out.mp4") == [Fraction(ms, 1000) for ms in times_ms]
     assert packets(tmp_path / "out.mp4", "audio") == packets(video, "audio")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in.mp4", "out.mp4"]
+
+
+def aspect_of(video: Path) -> Fraction | None:
+    with av.open(str(video)) as container:
+        return container.streams.video[0].sample_aspect_ratio
+
+
+@pytest.mark.parametrize(
+    ("layout", "stated", "rotation", "expected"),
+    [
+        ("side_by_side", Fraction(4, 3), 0, Fraction(4, 3)),
+        ("top_bottom", Fraction(4, 3), 90, Fraction(3, 4)),  # of the upright picture
+        ("side_by_side_half", Fraction(4, 3), 0, Fraction(4, 3)),
+        ("side_by_side_half", Fraction(2), 0, None),  # 2 is that of the squeezed views
+        ("top_bottom_half", Fraction(1, 2), 0, None),
+        ("side_by_side", None, 0, None),
+    ],
+)
+def test_an_output_has_the_pixel_aspect_of_the_views(tmp_path, layout, stated, rotation, expected):
+    frames = [packed(*pair, layout) for pair in example_pairs(1)]
+    frames = [np.rot90(frame, -rotation // 90) for frame in frames]
+    video = write_video(tmp_path / "in.mp4", frames, codec="libx264", rotation=rotation, pixel_aspect=stated)
+    words = ["--format", layout, "--layout", "side_by_side_half", "--no-rectify"]
+    assert run(video, tmp_path / "out_half_LR.mp4", *words) == 0
+    assert aspect_of(tmp_path / "out_half_LR.mp4") == expected
+
+
+def test_a_pixel_aspect_that_matroska_loses_is_noted(tmp_path, capsys):
+    video = write_side_by_side(
+        tmp_path / "in.mp4", example_pairs(1), codec="libx264", pixel_aspect=Fraction(4, 3)
+    )
+    assert run(video, tmp_path / "view.mkv", "--position", "0") == 0
+    assert aspect_of(tmp_path / "view.mkv") == Fraction(4, 3)
+    told = "pixels 1.33 times as wide as high, which FFmpeg cannot write beside a frame packing"
+    assert told not in capsys.readouterr().err
+    assert run(video, tmp_path / "out_half_LR.mkv", "--layout", "side_by_side_half") == 0
+    assert f"{told} in .mkv; write .mp4 instead" in capsys.readouterr().err
 
 
 def test_depth_in_16_bits_is_disparity_times_256(tmp_path):
