@@ -9,6 +9,7 @@ from fractions import Fraction
 from itertools import chain, islice
 from pathlib import Path
 
+import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
@@ -76,6 +77,7 @@ def convert_video(
     if job.is_fine:
         video.read_fine()
     recorder = _make_recorder(job, video)
+    recorder.check_size(*_measure_output_px(job, video.size_px))
     with (
         lock_output(out),
         open_parts(out, _list_settings(job, video, sources), job.name_of_saved) as parts,
@@ -119,6 +121,14 @@ def _make_recorder(job: VideoJob, video: StereoVideo) -> Recorder:
         pixel_aspect=video.pixel_aspect,
         threads=thread_count(job.backend.threads),
     )
+
+
+def _measure_output_px(job: VideoJob, size_px: tuple[int, int]) -> tuple[int, int]:
+    """Return the width and height of a view, or of a layout of both eyes' views."""
+    if job.arrangement is None:
+        return size_px
+    row, column = np.zeros((1, size_px[0], 3), np.uint8), np.zeros((size_px[1], 1, 3), np.uint8)
+    return job.arrangement(row, row).shape[1], job.arrangement(column, column).shape[0]
 
 
 def _note_aspect(job: VideoJob, video: StereoVideo, out: Path) -> list[Note]:

@@ -11,6 +11,7 @@ from fractions import Fraction
 from heapq import merge
 from io import BytesIO
 from itertools import islice
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -26,7 +27,7 @@ from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTr
 from av.video.stream import VideoStream
 from jaxtyping import UInt8, UInt16
 
-from stereoweave.errors import StereoweaveError
+from stereoweave.errors import Remedy, StereoweaveError
 from stereoweave.io.files import replacing
 from stereoweave.video.mp4_marks import VideoMarks, show_bounds, write_marks
 
@@ -52,19 +53,20 @@ Picture = UInt8[np.ndarray, "h w 3"] | UInt16[np.ndarray, "h w 3"] | UInt16[np.n
 
 
 class Encoding(NamedTuple):
-    """Encoder settings, as FFmpeg names them."""
+    """Encoder settings, as FFmpeg names them, and the largest width and height that the encoder takes."""
 
     codec: str
     pixel_format: str
     colour_range: ColorRange
     options: Mapping[str, str]
+    most_px: float = inf
 
 
 # Plays everywhere and looks like the input. Without B-frames (bf), parts can be joined at any frame. With
 # macroblock-tree rate control (mbtree), 1 part in 500 differed between runs on the same frames, even with one
 # thread (x264 165); without it, 0 of 4,447.
 H264 = Encoding(
-    "libx264", "yuv420p", ColorRange.MPEG, {"crf": "16", "preset": "faster", "bf": "0", "mbtree": "0"}
+    "libx264", "yuv420p", ColorRange.MPEG, {"crf": "16", "preset": "faster", "bf": "0", "mbtree": "0"}, 16384
 )
 # The same in 10 bits; parts begin with frames to which no earlier ones are related.
 HEVC10 = Encoding(
@@ -125,6 +127,15 @@ class Recorder:
     colours: Colours = BT709
     pixel_aspect: Fraction = Fraction(1)
     threads: int = 1
+
+    def check_size(self, width_px: int, height_px: int) -> None:
+        """Raise StereoweaveError if the encoder does not take frames of this size."""
+        if max(width_px, height_px) > self.encoding.most_px:
+            raise StereoweaveError(
+                f"expected output frames of at most {self.encoding.most_px} px per side for H.264, found "
+                f"{width_px}x{height_px} px",
+                remedy=Remedy("write HEVC, in 10 bits", ("bits", "depth10")),
+            )
 
     def write_part(self, path: Path, pictures: Iterable[tuple[Fraction, Picture]]) -> None:
         """Write images of the same size, each with its time in seconds, to a NUT file.
@@ -214,6 +225,7 @@ class Recorder:
 
     def _add_stream(self, part: OutputContainer, frame: VideoFrame) -> VideoStream:
         """Add a video stream for frames of the same size as `frame`."""
+        self.check_size(frame.width, frame.height)
         options = dict(self.encoding.options)
         if self.encoding.codec == "libx265":
             options["x265-params"] += f":pools={self.threads}"

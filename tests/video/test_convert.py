@@ -97,6 +97,16 @@ def test_an_output_has_the_pixel_aspect_of_the_views(tmp_path, layout, stated, r
     assert aspect_of(tmp_path / "out_half_LR.mp4") == expected
 
 
+def test_a_layout_too_large_for_h264_is_refused_before_anything_is_matched(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(Matcher, "estimate", None)
+    wide = [np.zeros((32, 8194, 3), np.uint8)]
+    eyes = [write_video(tmp_path / f"{eye}.mkv", wide, codec="ffv1") for eye in (0, 1)]
+    words = ["video", *map(str, eyes), "-o", str(tmp_path / "out.mp4"), "--layout"]
+    assert main([*words, "side_by_side"]) == 2
+    told = "expected output frames of at most 16384 px per side for H.264, found 16388x32 px"
+    assert f"{told}; write HEVC, in 10 bits (--bits, --depth10)" in capsys.readouterr().err
+
+
 def test_a_pixel_aspect_that_matroska_loses_is_noted(tmp_path, capsys):
     video = write_side_by_side(
         tmp_path / "in.mp4", example_pairs(1), codec="libx264", pixel_aspect=Fraction(4, 3)

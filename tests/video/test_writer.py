@@ -49,6 +49,11 @@ def recorder(**changes: object) -> Recorder:
     return Recorder(**{"encoding": H264, "time_base": 1 / NTSC, "rate": NTSC, **changes})
 
 
+def test_a_size_that_the_encoder_does_not_take_is_refused(tmp_path):
+    with pytest.raises(StereoweaveError, match="at most 16384 px per side for H.264, found 16386x32 px"):
+        recorder().write_part(tmp_path / "0.nut", [(Fraction(0), np.zeros((32, 16386, 3), np.uint8))])
+
+
 def frame_times(video: Path) -> list[Fraction]:
     with av.open(str(video)) as container:
         return [frame.pts * frame.time_base for frame in container.decode(video=0)]
