@@ -12,6 +12,7 @@ from PIL import Image
 from stereoweave.rendering.canvas_kernels import SAME_SURFACE_PX
 from stereoweave.rendering.layers import Layers, Reach, make_layers
 from stereoweave.rendering.layouts import median_disparity_px
+from stereoweave.rendering.renderer import check_convergence_px, check_strength
 from stereoweave.rendering.scaling import fit_size, scale_down
 from stereoweave.rendering.speckles import find_nearer_px
 from stereoweave.stereo import Estimate, StereoPair
@@ -52,8 +53,10 @@ def pack_scene(  # noqa: PLR0913 - all but the first two are optional
     the disparity in units of `code_px[1]` above `code_px[0]`. Its blue is how many pixels of disparity nearer
     the surface is whose colour a pixel of the front layer may carry.
     """
-    plane_px = median_disparity_px(estimate) if convergence_px is None else convergence_px
-    width = pair.left.shape[1]
+    strength, width = check_strength(strength), pair.left.shape[1]
+    plane_px = median_disparity_px(estimate)
+    if convergence_px is not None:
+        plane_px = check_convergence_px(convergence_px, width)
     largest_px = min(size_px[0], LARGEST_PX[0]), min(size_px[1], LARGEST_PX[1])
     pair, estimate = scale_down(pair, estimate, fit_size(pair.left.shape, largest_px))
     plane_px *= pair.left.shape[1] / width

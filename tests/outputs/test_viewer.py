@@ -17,6 +17,7 @@ from browsers import FLAGS, chromium
 from PIL import Image
 from playwright.sync_api import Browser, BrowserContext, Frame, Page
 
+from stereoweave.errors import StereoweaveError
 from stereoweave.outputs.viewer import make_viewer, viewer_script, write_viewer
 from stereoweave.outputs.viewer_scene import POSITIONS, pack_scene
 from stereoweave.rendering.renderer import Renderer
@@ -215,6 +216,19 @@ def test_the_page_allows_no_address_and_only_its_own_script(photo):
     assert "unsafe" not in page
     assert "http:" not in page
     assert "https:" not in page
+
+
+@pytest.mark.parametrize(
+    ("setting", "value", "told"),
+    [
+        ("convergence_px", -1000.0, "expected -{width} to {width} px (the picture's width), got -1000.0"),
+        ("strength", -1.0, "expected 0 or more, got -1.0"),
+    ],
+)
+def test_a_page_is_refused_the_shifts_that_a_view_is_refused(scene, setting, value, told):
+    with pytest.raises(StereoweaveError) as caught:
+        make_viewer(*scene, **{setting: value})
+    assert str(caught.value) == f"{setting}: {told.format(width=scene[0].left.shape[1])}"
 
 
 def test_a_title_cannot_add_to_the_page(scene):
