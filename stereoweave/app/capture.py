@@ -197,7 +197,8 @@ def _open_source(source: str, format: str | None) -> _Source:
     elif "://" in source:
         found = "no stream at that address"
     else:
-        found = "a file that OpenCV cannot open" if Path(source).exists() else "no such file"
+        exists = "a folder" if Path(source).is_dir() else "a file that OpenCV cannot open"
+        found = exists if Path(source).exists() else "no such file"
     raise FormatError(
         f"{source}: expected a camera number, a video file, a stream address, or pictures such as "
         f"frame%03d.png, found {found}"

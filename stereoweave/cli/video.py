@@ -42,7 +42,7 @@ Videos = Annotated[
         metavar="VIDEO",
         help="Stereo video with both views in each frame, in two streams or in turn, spatial video "
         "(MV-HEVC), or LEFT RIGHT. Each is a video file, a folder of pictures, or a quoted pattern such as "
-        "'left/*.png'.",
+        "'left/*.png' or left/%03d.png.",
     ),
 ]
 Out = Annotated[

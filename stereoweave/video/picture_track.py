@@ -1,7 +1,7 @@
 """A series of pictures as a track of frames."""
 
 import re
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import suppress
 from fractions import Fraction
 from itertools import islice
@@ -19,6 +19,8 @@ from stereoweave.video.track_frame import TrackFrame
 
 # Where in a track its `samples` are taken, as shares of its length.
 SAMPLED_AT = 0.1, 0.3, 0.5, 0.7, 0.9
+# As in printf; the group is the least number of digits.
+_NUMBER = re.compile(r"%(?:0?([0-9]+))?d")
 
 
 class PictureTrack:
@@ -86,9 +88,16 @@ class PictureTrack:
 
 
 def list_picture_files(path: Path) -> list[Path] | None:
-    """Return the pictures in a folder or matching a glob pattern, in natural order; None for other paths."""
+    """Return the pictures in a folder or matching a pattern, in natural order; None for other paths.
+
+    A pattern is a glob, such as left_*.png, or has a number as in FFmpeg and OpenCV, such as left_%03d.png.
+    """
     if path.is_dir():
-        found = path.iterdir()
+        found: Iterable[Path] = path.iterdir()
+    elif not path.exists() and (number := _NUMBER.search(path.name)):
+        before, after = (re.escape(part) for part in (path.name[: number.start()], path.name[number.end() :]))
+        name = re.compile(rf"{before}[0-9]{{{number[1] or 1},}}{after}")
+        found = filter(lambda file: name.fullmatch(file.name), path.parent.glob("*"))
     elif not path.exists() and re.search(r"[*?\[]", path.name):
         found = path.parent.glob(path.name)
     else:

@@ -219,7 +219,7 @@ def open_video(
     packing. A spatial video (MV-HEVC) says itself which view is the left one.
 
     Args:
-        paths: One or two videos, folders of pictures, or glob patterns that match pictures.
+        paths: One or two videos, folders of pictures, or patterns that match pictures.
         format: Frame packing of a single video, a name in `FRAME_PACKINGS`; none for a spatial video.
             Default: detected.
         rate: Frame rate for pictures, in frames per second. Default: 25.

@@ -222,11 +222,11 @@ Track = VideoTrack | PictureTrack
 
 
 def open_track(path: Path, rate: Fraction | None) -> Track:
-    """Open a video file, a folder of pictures, or the pictures that match a glob pattern.
+    """Open a video file, a folder of pictures, or the pictures that match a pattern.
 
     Args:
-        path: File, folder or pattern, such as frames/left_*.png. Pictures are in natural order: 2 comes
-            before 10.
+        path: File, folder or pattern, such as frames/left_*.png or frames/%03d.png. Pictures are in natural
+            order: 2 comes before 10.
         rate: Frame rate for pictures, in frames per second. Default: 25.
 
     Raises:

@@ -145,6 +145,7 @@ def test_a_series_of_pictures_is_a_video(tmp_path):
     [
         ("nowhere.mp4", "no such file"),
         (str(TEXTURED / "calib.txt"), "a file that OpenCV cannot open"),
+        (str(TEXTURED), "a folder"),
         ("999", "no free camera with that number"),
         ("http://127.0.0.1:1/stream", "no stream at that address"),
     ],

@@ -119,6 +119,15 @@ def test_a_pixel_aspect_that_matroska_loses_is_noted(tmp_path, capsys):
     assert f"{told} in .mkv; write .mp4 instead" in capsys.readouterr().err
 
 
+def test_pictures_named_by_patterns_with_numbers_are_converted(tmp_path):
+    for number, pair in enumerate(example_pairs(2)):
+        for side, picture in zip(("left", "right"), pair, strict=True):
+            write_image(tmp_path / side / f"{number:03}.png", picture)
+    sources = [str(tmp_path / side / "%03d.png") for side in ("left", "right")]
+    assert main(["video", *sources, "-o", str(tmp_path / "out.mp4"), "--position", "0"]) == 0
+    assert len(frames_of(tmp_path / "out.mp4")) == 2
+
+
 def test_depth_in_16_bits_is_disparity_times_256(tmp_path):
     video = write_side_by_side(tmp_path / "in.mp4", example_pairs(2), codec="libx264")
     assert run(video, tmp_path / "out.mkv", "--depth16") == 0

@@ -23,6 +23,7 @@ from stereoweave.errors import StereoweaveError
 from stereoweave.io.images import write_image
 from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS, detect_layout, measure_resemblance
 from stereoweave.video import tracks
+from stereoweave.video.picture_track import list_picture_files
 from stereoweave.video.reader import open_video
 from stereoweave.video.tracks import open_track
 
@@ -413,6 +414,16 @@ def test_a_rotated_video_is_turned_upright(tmp_path):
 def test_a_name_with_brackets_is_a_file_if_that_file_exists(tmp_path):
     path = write_side_by_side(tmp_path / "video [3D].mkv", example_pairs(2))
     assert open_video([path]).frame_count == 2
+
+
+@pytest.mark.parametrize(
+    ("pattern", "numbers"), [("f_%03d.png", [7, 8, 1000]), ("f_%d.png", [2, 7, 8, 1000]), ("g_%03d.png", [])]
+)
+def test_a_pattern_with_a_number_names_pictures_in_numerical_order(tmp_path, pattern, numbers):
+    for name in ("f_2", "f_007", "f_008", "f_1000", "f_x", "gf_009"):
+        write_image(tmp_path / f"{name}.png", np.full((32, 32, 3), 50, np.uint8))
+    files = list_picture_files(tmp_path / pattern)
+    assert [int(file.stem[2:]) for file in files] == numbers
 
 
 def test_without_pyav_the_extra_is_named_and_pictures_still_work(tmp_path, monkeypatch):
