@@ -1,4 +1,4 @@
-"""Tone mapping of HDR, of videos and pictures, to sRGB."""
+"""Tone mapping of HDR, and conversion of wide colours, of videos and pictures, to sRGB."""
 
 from functools import cache
 
@@ -10,18 +10,22 @@ from jaxtyping import Float32, UInt8, UInt16
 _PQ, _HLG = 16, 18
 HDR = {_PQ: "PQ", _HLG: "HLG"}
 """Names of the transfer functions of HDR."""
-_PRIMARIES_BT709, _PRIMARIES_P3 = 1, 12
+_PRIMARIES_BT709, _PRIMARIES_BT2020, _PRIMARIES_P3 = 1, 9, 12
 
 # Luminance of a white surface and of the brightest highlights (ITU-R BT.2408). The first becomes SDR's peak.
 _WHITE_NITS, _PEAK_NITS = 203.0, 1000.0
 _PQ_PEAK_NITS = 10_000.0
 # Linear RGB of BT.2020 (ITU-R BT.2087), and of Display P3 (CSS Color 4), to that of BT.709.
-_BT2020_TO_BT709 = np.array(
-    [[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]], np.float32
-)
-_P3_TO_BT709 = np.array(
-    [[1.2249, -0.2249, 0.0], [-0.0421, 1.0421, 0.0], [-0.0196, -0.0786, 1.0983]], np.float32
-)
+_TO_BT709 = {
+    _PRIMARIES_BT2020: np.array(
+        [[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]], np.float32
+    ),
+    _PRIMARIES_P3: np.array(
+        [[1.2249, -0.2249, 0.0], [-0.0421, 1.0421, 0.0], [-0.0196, -0.0786, 1.0983]], np.float32
+    ),
+}
+WIDE_COLOURS = frozenset(_TO_BT709)
+"""Numbers of the primaries that `convert_primaries` converts."""
 _LUMA_BT2020 = np.array([[0.2627, 0.6780, 0.0593]], np.float32)
 # FFmpeg's conversion to 16-bit RGB makes this of white; it rounds to 65283.
 WHITE_CODE = 255 * 256
@@ -50,9 +54,28 @@ def map_tones(
     steps = np.sqrt(np.sqrt(light.max(axis=2))) * (_GAINS - 1) + 0.5
     light *= _gain_table()[np.minimum(steps, _GAINS - 1).astype(np.uint16)][..., None]
     if primaries != _PRIMARIES_BT709:
-        to_bt709 = _P3_TO_BT709 if primaries == _PRIMARIES_P3 else _BT2020_TO_BT709
-        light = cv2.transform(light, to_bt709)
+        light = cv2.transform(light, _TO_BT709.get(primaries, _TO_BT709[_PRIMARIES_BT2020]))
+    return _encode_srgb(light)
+
+
+def convert_primaries(image: UInt8[np.ndarray, "h w 3"], primaries: int) -> UInt8[np.ndarray, "h w 3"]:
+    """Return an SDR image of these primaries as sRGB. Colours outside BT.709 are clipped.
+
+    Primaries outside `WIDE_COLOURS` are taken for those of BT.709, from which the others hardly differ.
+    """
+    if primaries not in _TO_BT709:
+        return image
+    return _encode_srgb(cv2.transform(_light_of_srgb()[image], _TO_BT709[primaries]))
+
+
+def _encode_srgb(light: Float32[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
     return _srgb_table()[(np.clip(light, 0, 1) * 65535 + 0.5).astype(np.uint16)]
+
+
+@cache
+def _light_of_srgb() -> Float32[np.ndarray, "256"]:
+    codes = np.arange(256) / 255
+    return np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
 @cache

@@ -1,11 +1,11 @@
-"""Decoded frames as 8-bit RGB: matrix and range of their colours; HDR is tone-mapped."""
+"""Decoded frames as 8-bit sRGB: matrix, range and primaries of their colours; HDR is tone-mapped."""
 
 from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from stereoweave.io.hdr import HDR, WHITE_CODE, map_tones
+from stereoweave.io.hdr import HDR, WHITE_CODE, WIDE_COLOURS, convert_primaries, map_tones
 
 if TYPE_CHECKING:
     import av
@@ -26,7 +26,7 @@ def convert_to_rgb(frame: "av.VideoFrame") -> UInt8[np.ndarray, "h w 3"]:
     if frame.color_trc in HDR:
         picture = map_tones(_decode_rgb(frame, _DEEP_RGB), frame.color_trc, frame.color_primaries)
     else:
-        picture = _decode_rgb(frame, "rgb24")
+        picture = convert_primaries(_decode_rgb(frame, "rgb24"), frame.color_primaries)
     return np.ascontiguousarray(np.rot90(picture, frame.rotation // 90))
 
 
@@ -42,15 +42,18 @@ def name_hdr(frame: "av.VideoFrame") -> str | None:
     return HDR.get(frame.color_trc)
 
 
-def hdr_colours(frame: "av.VideoFrame") -> tuple[int, int, int] | None:
-    """Return the primaries, transfer function and matrix of an HDR frame, by FFmpeg's numbers; else None.
+def own_colours(frame: "av.VideoFrame") -> tuple[int, int, int] | None:
+    """Return the primaries, transfer function and matrix of HDR and of wide colours, by FFmpeg's numbers.
 
-    Primaries that the file does not state are those of BT.2020.
+    None for other frames. Primaries that an HDR file does not state are those of BT.2020.
     """
-    if frame.color_trc not in HDR:
+    if frame.color_trc in HDR:
+        primaries = _PRIMARIES_BT2020 if frame.color_primaries in _UNTAGGED else frame.color_primaries
+        return primaries, frame.color_trc, _BT2020
+    if frame.color_primaries not in WIDE_COLOURS:
         return None
-    primaries = _PRIMARIES_BT2020 if frame.color_primaries in _UNTAGGED else frame.color_primaries
-    return primaries, frame.color_trc, _BT2020
+    transfer = _BT709 if frame.color_trc in _UNTAGGED else frame.color_trc
+    return frame.color_primaries, transfer, _BT2020
 
 
 def _decode_rgb(frame: "av.VideoFrame", format: str) -> np.ndarray:

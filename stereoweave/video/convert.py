@@ -117,7 +117,7 @@ def _make_recorder(job: VideoJob, video: StereoVideo) -> Recorder:
         # FFmpeg stores numerators and denominators in 32 bits.
         rate=video.rate.limit_denominator(100_000),
         packing=PACKED[job.layout].declared if job.layout in PACKED else None,
-        colours=Colours(*video.hdr_colours) if job.is_fine and video.hdr_colours else BT709,
+        colours=Colours(*video.own_colours) if job.is_fine and video.own_colours else BT709,
         pixel_aspect=video.pixel_aspect,
         threads=thread_count(job.backend.threads),
     )

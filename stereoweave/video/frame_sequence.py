@@ -37,7 +37,7 @@ class FrameSequence:
         self.time_base, self.rate = track.time_base, track.rate / 2
         self.size_px, self.sound, self.truncation = track.size_px, track.sound, track.truncation
         self.pixel_aspect = track.pixel_aspect
-        self.sphere, self.hdr_colours = track.sphere, track.hdr_colours
+        self.sphere, self.own_colours = track.sphere, track.own_colours
         odd = [Note("the last frame is dropped, because no second view follows it")]
         self.notes = [*track.notes, *(odd if len(track.steps) % 2 else [])]
 

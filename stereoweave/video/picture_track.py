@@ -36,7 +36,7 @@ class PictureTrack:
     camera: StereoCamera | None = None
     sphere: SphereMark | None = None
     notes: Sequence[Note] = ()
-    hdr_colours: tuple[int, int, int] | None = None
+    own_colours: tuple[int, int, int] | None = None
     retimed: Collection[int] = ()
     sound: Path | None = None
     truncation: str | None = None

@@ -89,7 +89,8 @@ class StereoVideo:
         declared_sphere: Projection of a VR180, 360-degree or ordinary video, if the file declares one.
         sphere: Of a VR180 or 360-degree video, the window that its frames show; see `show`.
         baseline_m: Distance of the eyes of such a video; None if it is unknown.
-        hdr_colours: Primaries, transfer function and matrix of HDR, by FFmpeg's numbers; None for SDR.
+        own_colours: Primaries, transfer function and matrix of HDR and of wide colours, by FFmpeg's numbers;
+            None for others.
         on_frame: Function that `frames` calls with the number of each frame that it yields, to show progress.
     """
 
@@ -122,7 +123,7 @@ class StereoVideo:
         self.baseline_m: float | None = None
         self._cutter: Cutter | None = None
         self._first, self._last = 0, self.frame_count - 1
-        self.hdr_colours = first.hdr_colours
+        self.own_colours = first.own_colours
         self._reads_fine = False
 
     def read_fine(self) -> None:

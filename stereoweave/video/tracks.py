@@ -14,7 +14,7 @@ from jaxtyping import Float32, UInt8
 
 from stereoweave.errors import FormatError, Note, Remedy, StereoweaveError
 from stereoweave.stereo import StereoCamera
-from stereoweave.video.colours import convert_to_fine, convert_to_rgb, hdr_colours, name_hdr
+from stereoweave.video.colours import convert_to_fine, convert_to_rgb, name_hdr, own_colours
 from stereoweave.video.packings import FRAME_SEQUENTIAL
 from stereoweave.video.picture_track import SAMPLED_AT, PictureTrack, list_picture_files
 from stereoweave.video.spatial import RIGHT, Stereo3D, ViewPair, is_spatial, pair_views, read_stereo3d
@@ -66,7 +66,8 @@ class VideoTrack:
         camera: Camera of the views of a spatial video, if the file declares it and rotates no views.
         sphere: Projection of a VR180, 360-degree or ordinary video, if the file declares one.
         notes: Notes on views and colours.
-        hdr_colours: Primaries, transfer function and matrix of HDR, by FFmpeg's numbers; else None.
+        own_colours: Primaries, transfer function and matrix of HDR and of wide colours, by FFmpeg's numbers;
+            else None.
         sound: Path of the file if it has sound, else None.
         truncation: Message about a file that ends early; None for a complete file.
 
@@ -105,7 +106,7 @@ class VideoTrack:
         self._packed = declared if first.rotation % 360 == 0 and not self.is_spatial else Stereo3D()
         self.sphere = read_sphere(self.name, first)
         self.notes = [declared.note()] if self.is_spatial else []
-        self.hdr_colours = hdr_colours(first)
+        self.own_colours = own_colours(first)
         if hdr := name_hdr(first):
             self.notes.append(Note(f"the video is HDR ({hdr}); it is tone-mapped to SDR (BT.709)"))
 

@@ -44,6 +44,24 @@ def test_hdr_with_the_primaries_of_bt709_keeps_them():
     assert [red, green, blue] == pytest.approx([srgb(80 / 203), srgb(20 / 203), srgb(20 / 203)], abs=1)
 
 
+@pytest.mark.parametrize(
+    ("primaries", "rgb", "expected"),
+    [
+        # Code 128 is 0.2159 of white's light. In BT.709, red of BT.2020 has 1.6605 * 0.2159 = 0.3584 of it,
+        # and less than no green and blue; green of P3 has 1.0421 * 0.2159 = 0.2250.
+        (BT2020, (128, 0, 0), (srgb(0.3584), 0, 0)),
+        (12, (0, 128, 0), (0, srgb(0.2250), 0)),
+        (BT2020, (200, 200, 200), (200, 200, 200)),
+        (BT709, (128, 0, 0), (128, 0, 0)),
+        (2, (128, 0, 0), (128, 0, 0)),
+    ],
+)
+def test_wide_colours_become_those_of_bt709(primaries, rgb, expected):
+    frame = av.VideoFrame.from_ndarray(np.full((16, 32, 3), rgb, np.uint8), "rgb24")
+    frame.color_primaries, frame.color_trc = primaries, BT709
+    assert convert_to_rgb(frame)[0, 0].tolist() == pytest.approx(expected, abs=1)
+
+
 def write_ten_bits(path, codec, pairs, transfer, *, colorspace):
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=25)

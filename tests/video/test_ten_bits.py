@@ -54,6 +54,15 @@ def luma(frame):
     return values(frame.planes[0])
 
 
+def test_wide_colours_keep_their_primaries_in_ten_bits_alone(tmp_path):
+    source = write_hdr(tmp_path / "in.mp4", example_pairs(2), transfer=BT709)
+    for bits, expected in (("10", (BT2020, BT709, BT2020)), ("8", (BT709, BT709, BT709))):
+        out = tmp_path / f"{bits}.mp4"
+        assert run(source, out, "--position", "0", "--bits", bits) == 0
+        frame = decoded(out)[0]
+        assert (frame.color_primaries, frame.color_trc, frame.colorspace) == expected
+
+
 @pytest.fixture(scope="module")
 def hlg(tmp_path_factory):
     path = tmp_path_factory.mktemp("hdr") / "hlg.mp4"
