@@ -306,8 +306,20 @@ def choose_layout(path: str | Path, name: str | None) -> str | None:
     if name in ANIMATIONS:
         check_animation_ending(path)
     else:
-        picture_kind(path)
+        _check_picture_ending(path, name)
     return name
+
+
+def _check_picture_ending(path: str | Path, name: str | None) -> None:
+    """Raise a StereoweaveError unless a picture has this extension; without a layout, it names the others."""
+    try:
+        picture_kind(path)
+    except StereoweaveError as error:
+        if name is not None:
+            raise
+        others = f"3-D pictures have {', '.join(_LAYOUT_BY_ENDING)}"
+        moving = f"{' and '.join(ANIMATIONS)} {', '.join(_MOVING_ENDINGS)}"
+        raise error.with_detail(f"{others}; {moving}") from error
 
 
 def has_two_views(name: str | None) -> bool:

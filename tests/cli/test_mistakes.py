@@ -74,7 +74,8 @@ MISTAKES = {
     f"measure {PAIR} --from 1,2 --to 3000,4 --focal-px 500 --baseline-m 0.1": "expected a pixel of the left "
     "picture, from 0,0 to 639,479, found 3000,4",
     # Views.
-    f"view {PAIR} -o view": f"view: expected a picture file extension ({PICTURE_ENDINGS}), found none",
+    f"view {PAIR} -o view": f"view: expected a picture file extension ({PICTURE_ENDINGS}), found none; "
+    "3-D pictures have .mpo, .heic, .jps, .html; sweep and wiggle .mp4, .gif",
     f"view {PAIR} --layout wiggle -o wiggle.png": "wiggle.png: expected an animation file extension (.mp4, "
     ".gif, .webp), found .png",
     f"view {PAIR} --layout viewer -o photo.png": "photo.png: expected the file extension .html for the "

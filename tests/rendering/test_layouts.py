@@ -258,7 +258,12 @@ def test_a_layout_is_chosen_by_name_or_by_the_file_s_ending(path, name, expected
         ("view.png", "viewer", r"view\.png: expected the file extension \.html for the layout viewer"),
         ("view.html", "quilt", r"view\.html: expected the layout viewer .* found quilt"),
         ("view.mp4", None, r"view\.mp4: expected an animation .* choose sweep or wiggle \(layout\)$"),
-        ("view.txt", None, r"view\.txt: expected a picture file extension \(\.png"),
+        (
+            "view.txt",
+            None,
+            r"found \.txt; 3-D pictures have \.mpo, .*, \.html; sweep and wiggle \.mp4, \.gif$",
+        ),
+        ("view.txt", "quilt", r"view\.txt: expected a picture file extension \(\.png.*, found \.txt$"),
     ],
 )
 def test_an_unknown_layout_or_one_that_does_not_fit_the_ending_is_refused(path, name, expected):
