@@ -248,8 +248,11 @@ def parse_range_px(text: str | None) -> tuple[float, float] | None:
 
 def parse_pixel(option: str, text: str) -> tuple[int, int]:
     """Parse an option's value X,Y into the column and row of a pixel."""
-    column, row = _parse_two_numbers(option, text, "column and row of a pixel, such as 320,240")
-    return round(column), round(row)
+    expected = "column and row of a pixel, such as 320,240"
+    column, row = _parse_two_numbers(option, text, expected)
+    if not (column.is_integer() and row.is_integer()):
+        raise StereoweaveError(f"{option}: expected {expected}, in whole numbers, found {text!r}")
+    return int(column), int(row)
 
 
 def _parse_two_numbers(option: str, text: str, expected: str) -> tuple[float, float]:

@@ -199,6 +199,7 @@ def test_the_command_measures_between_two_pixels(capfd):
             {"calib": TEXTURED / "calib.txt"},
             "--from: expected column and row of a pixel.* found '320'",
         ),
+        ("40.5,30", {"calib": TEXTURED / "calib.txt"}, "--from: .* in whole numbers, found '40.5,30'"),
         ("1,2,3", {"calib": TEXTURED / "calib.txt"}, "--from: .* found '1,2,3'"),
         ("a,b", {"calib": TEXTURED / "calib.txt"}, "--from: .* found 'a,b'"),
         ("320,240", {}, r"give a calibration.*\(calibration, focal_px, baseline_m\)"),
