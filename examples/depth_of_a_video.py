@@ -12,6 +12,8 @@ import numpy as np
 import stereoweave as sw
 from stereoweave.io.colormap import colour_disparity
 
+if len(sys.argv) != 2:
+    sys.exit("usage: python depth_of_a_video.py FILM.mp4 (or a camera's number)")
 source = sys.argv[1]
 capture = cv2.VideoCapture(int(source) if source.isdigit() else source)
 matcher = sw.Matcher("small")  # loaded once

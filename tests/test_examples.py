@@ -117,6 +117,11 @@ def test_depth_of_a_video(run, tmp_path):
     assert first.shape == (120, 160, 3)
 
 
+def test_depth_of_a_video_without_a_video_says_how_to_give_one(run):
+    with pytest.raises(SystemExit, match=r"^usage: python depth_of_a_video\.py FILM\.mp4"):
+        run("depth_of_a_video.py")
+
+
 def test_torch_tensors(run, tmp_path):
     assert run("torch_tensors.py").startswith("features [1, 5, 480, 640]")
     features = torch.load(tmp_path / "features.pt")
