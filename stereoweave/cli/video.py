@@ -50,8 +50,9 @@ Out = Annotated[
     typer.Option(
         "--out",
         "-o",
-        help="Video to write: .mp4, .mov or .mkv. Rerun the same command to resume after an "
-        f"interruption, which loses at most {PART_S} s of video.",
+        help="Video to write: .mp4, .mov or .mkv. Players recognise some layouts by a mark in the file name, "
+        "which is added automatically: out.mp4 becomes out_TBF_fulltb.mp4 for top_bottom. Rerun the same "
+        f"command to resume after an interruption, which loses at most {PART_S} s of video.",
     ),
 ]
 Depth = Annotated[
@@ -126,7 +127,10 @@ Preview = Annotated[
 ]
 VideoModel = Annotated[
     str,
-    typer.Option(help="Shipped network: small, or base, which is slower; or an .onnx matcher file."),
+    typer.Option(
+        help="Shipped network: small, or base, which is slower; or an .onnx matcher file. best, made for "
+        "stills, is much slower still."
+    ),
 ]
 
 
