@@ -7,7 +7,7 @@ from inspect import signature
 from pathlib import Path
 from typing import Literal
 
-from stereoweave.arguments import as_two_numbers, check_kind, check_number, describe
+from stereoweave.arguments import as_two_numbers, check_kind, describe
 from stereoweave.cameras import auto_align
 from stereoweave.cameras.calibration_files import read_rig
 from stereoweave.cameras.diagnosis import find_problems
@@ -150,9 +150,6 @@ def _request_window(
     """Return the request for a window; raise StereoweaveError for values of wrong types."""
     if projection is not None:
         check_kind("projection", projection, str)
-    for name, value in (("fov_deg", fov_deg), ("lens_fov_deg", lens_fov_deg)):
-        if value is not None:
-            check_number(name, value)
     look = None if look_deg is None else as_two_numbers("look_deg", look_deg, "yaw and pitch in degrees")
     return SphereRequest(projection=projection, look_deg=look, fov_deg=fov_deg, lens_fov_deg=lens_fov_deg)
 
