@@ -87,7 +87,7 @@ class NewestFrame:
 
     def __init__(self, folder: Path) -> None:
         self._file, self._wish = folder / "newest.json", folder / "wish.txt"
-        self._seen_ns = 0
+        self._seen: tuple[int, int] | None = None
 
     def ask(self, output: str) -> None:
         """Ask for pictures of another output, from the next frame on."""
@@ -110,10 +110,12 @@ class NewestFrame:
     def read(self) -> FramePictures | None:
         """Return the newest frame; None if it was read before, and before the first one."""
         try:
-            written_ns = self._file.stat().st_mtime_ns
-            if written_ns == self._seen_ns:
+            status = self._file.stat()
+            # Two frames may have one time, because the clock of a file system is coarse, but not one inode.
+            written = status.st_mtime_ns, status.st_ino
+            if written == self._seen:
                 return None
-            self._seen_ns = written_ns
+            self._seen = written
             time_s, output, left, made = json.loads(self._file.read_text(encoding="utf-8"))
             if output not in OUTPUTS or not 0 <= time_s < _MOST_S:
                 return None

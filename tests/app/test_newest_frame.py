@@ -1,6 +1,7 @@
 """The newest frame of a conversion: its small pictures, how they reach the page, and what they may cost."""
 
 import io
+import os
 import time
 from fractions import Fraction
 from functools import partial
@@ -100,6 +101,15 @@ def test_the_page_reads_each_frame_once(tmp_path):
         written = FramePictures(number / 25, "depth", b"left \xff", bytes([number]))
         of_work.write(written)
         assert of_page.read() == written
+        assert of_page.read() is None
+
+
+def test_the_page_reads_two_frames_that_were_written_at_the_same_time(tmp_path):
+    of_work, of_page = NewestFrame(tmp_path), NewestFrame(tmp_path)
+    for time_s in (0.0, 0.04):
+        of_work.write(FramePictures(time_s, "depth", b"left", b"made"))
+        os.utime(tmp_path / "newest.json", (1e9, 1e9))
+        assert of_page.read().time_s == time_s
         assert of_page.read() is None
 
 
