@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from command_output import without_steps
 from error_examples import LAYOUTS, write_error_examples
 
 from stereoweave.cli.root import main
@@ -139,7 +140,7 @@ def folder(tmp_path, monkeypatch) -> Path:
 @pytest.mark.parametrize("command", ERRORS)
 def test_an_error_names_settings_by_their_option(capsys, command):
     assert main(command.split()) == 2
-    assert capsys.readouterr().err == f"stereoweave: {ERRORS[command]}\n"
+    assert without_steps(capsys.readouterr().err) == [f"stereoweave: {ERRORS[command]}"]
 
 
 @pytest.mark.parametrize("command", NOTES)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import onnx
 import pytest
+from command_output import without_steps
 from onnx import TensorProto, helper
 from PIL import Image
 
@@ -201,7 +202,7 @@ def test_a_mistake_is_reported_in_one_line_and_leaves_nothing_behind(mistakes, c
     assert run(arguments) == 2
     printed, told = capfd.readouterr()
     assert printed == ""
-    (line,) = (line for line in told.splitlines() if not line.endswith(" …"))  # beside steps
+    (line,) = without_steps(told)
     assert line.startswith("stereoweave: ")
     assert [fragment for fragment in fragments if fragment not in line] == []
     assert sorted(mistakes.rglob("*")) == before
@@ -362,7 +363,7 @@ def test_stdout_is_only_json_that_names_the_files(pictures, capfd):
     assert run("depth left.png right.png --model eight.onnx --calib calib.txt -o out --json") == 0
     printed, told = capfd.readouterr()
     summary = json.loads(printed)
-    assert [line for line in told.splitlines() if not line.endswith(" …")] == []  # only steps
+    assert without_steps(told) == []
     assert summary["pictures"] == ["left.png", "right.png"]
     assert (summary["model"], summary["width_px"], summary["height_px"]) == ("eight.onnx", 96, 64)
     assert 7 < summary["disparity_min_px"] <= 8 <= summary["disparity_max_px"] < 9
@@ -380,7 +381,7 @@ def test_problems_of_a_pair_are_printed(pictures, capfd, command):
         run(f"{command} black.png black.png --threads 1 -o {'out.png' if command == 'view' else 'out'}") == 0
     )
     printed, told = capfd.readouterr()
-    assert [line for line in told.splitlines() if not line.endswith(" …")] == []  # only steps
+    assert without_steps(told) == []
     notes = json.loads(printed)["notes"] if "--json" in command else printed.splitlines()
     assert [note for note in notes if note.startswith("only 0 % of the disparities are confident")] != []
 
@@ -554,7 +555,7 @@ def test_a_mistake_with_bench_networks_is_reported_in_one_line(mistakes, capfd, 
     assert run(arguments) == 2
     printed, told = capfd.readouterr()
     assert printed == ""
-    (line,) = (line for line in told.splitlines() if not line.endswith(" …"))  # beside steps
+    (line,) = without_steps(told)
     assert line.startswith("stereoweave: ")
     assert [fragment for fragment in fragments if fragment not in line] == []
     assert sorted(mistakes.rglob("*")) == before
