@@ -247,7 +247,7 @@ def test_a_stopped_command_says_so_and_leaves_nothing(tmp_path, number):
         "signal.signal(signal.SIGHUP, signal.SIG_DFL); faulthandler.dump_traceback_later(120, exit=True); "
         "from stereoweave.cli.root import main; sys.exit(main())"
     )
-    command = [sys.executable, "-c", program, "depth", *pictures, "-o", tmp_path / "out"]
+    command = [sys.executable, "-c", program, "depth", *pictures, "--model", "small", "-o", tmp_path / "out"]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     while not any(tmp_path.glob(".stereoweave-*/*")) and process.poll() is None:
         time.sleep(0.01)
