@@ -93,8 +93,30 @@ def open_page(browser: Browser, width: int, height: int, **options) -> Iterator[
     assert errors == []
 
 
+def visit(page: Page, report: Path) -> None:
+    """Open a report, and wait until it can be read out."""
+    page.goto(report.as_uri())
+    page.evaluate("unpacked.then(() => null)")
+
+
+def wait_until(page: Page, condition: str) -> None:
+    """Wait for a condition in JavaScript; the page forbids Playwright's own way, which calls eval."""
+    page.evaluate(
+        "new Promise((met) => {"
+        f"  const look = () => {condition} ? met() : requestAnimationFrame(look);"
+        "  look();"
+        "})"
+    )
+
+
 def choose(page: Page, kind: str) -> None:
     page.get_by_role("radio", name=kind).check()
+
+
+def choose_3_d(page: Page) -> None:
+    """Choose the 3-D view, and wait until it can be turned."""
+    choose(page, "3-D")
+    wait_until(page, "mesh")
 
 
 def shown(page: Page, what: str) -> np.ndarray:
@@ -125,7 +147,7 @@ def put_slider(page: Page, position: float) -> np.ndarray:
 
 def test_the_slider_moves_the_viewpoint_smoothly_about_the_middle_of_the_scene(page, step):
     """From 0.25 to 0.77 what is 32 px farther than the median moves by 0.52 * 32 px."""
-    page.goto(step.as_uri())
+    visit(page, step)
     page.wait_for_selector("#photo")
     near, far = moves_px(put_slider(page, 0.25), put_slider(page, 0.77))
     assert near == pytest.approx(0, abs=0.5)
@@ -136,7 +158,7 @@ def test_the_slider_moves_the_viewpoint_smoothly_about_the_middle_of_the_scene(p
 
 def test_without_webgl_the_slider_shows_the_nearest_of_five_views(page, step):
     page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
-    page.goto(step.as_uri())
+    visit(page, step)
     near, far = moves_px(put_slider(page, 0.27), put_slider(page, 0.77))
     assert near == pytest.approx(0, abs=0.5)
     assert far == pytest.approx(0.5 * SHIFT_PX, abs=1)
@@ -146,7 +168,7 @@ def test_without_webgl_the_slider_shows_the_nearest_of_five_views(page, step):
 
 def test_a_browser_that_cannot_decompress_shows_all_but_the_read_out_and_the_3_d_view(page, report):
     page.add_init_script("delete window.DecompressionStream")
-    page.goto(report.as_uri())
+    visit(page, report)
     page.locator("#depth").hover()
     assert page.locator(".reading").nth(1).text_content() == "Far is blue, near is red."
     choose(page, "3-D")
@@ -164,7 +186,7 @@ def test_without_scripts_the_report_shows_the_middle_view_and_no_controls(browse
 
 
 def test_the_marks_below_the_slider_are_at_the_cameras(page, report):
-    page.goto(report.as_uri())
+    visit(page, report)
     slider = page.locator("#position").bounding_box()
     for mark, position in zip(page.locator(".ends span").all(), (0, 1), strict=True):
         box = mark.bounding_box()
@@ -173,7 +195,7 @@ def test_the_marks_below_the_slider_are_at_the_cameras(page, report):
 
 
 def test_dragging_the_picture_moves_the_viewpoint_and_does_not_enlarge_it(page, report):
-    page.goto(report.as_uri())
+    visit(page, report)
     stage = page.locator("#stage").bounding_box()
     page.mouse.move(stage["x"] + stage["width"] / 2, stage["y"] + stage["height"] / 2)
     page.mouse.down()
@@ -189,8 +211,10 @@ def test_dragging_the_picture_moves_the_viewpoint_and_does_not_enlarge_it(page, 
     ("share", "ending"), [(0.25, "confidence 100 %"), (0.75, "confidence 25 %, occluded")]
 )
 def test_pointing_at_a_picture_reads_disparity_depth_and_confidence(page, report, share, ending):
-    page.goto(report.as_uri())
-    for picture in page.locator(".frame").all():
+    visit(page, report)
+    pictures = page.locator(".frame").all()
+    assert len(pictures) == 3
+    for picture in pictures:
         box = picture.bounding_box()
         page.mouse.move(box["x"] + box["width"] * share, box["y"] + box["height"] / 2)
         # 400 px * 0.04 m / 32 px
@@ -199,7 +223,7 @@ def test_pointing_at_a_picture_reads_disparity_depth_and_confidence(page, report
 
 
 def test_the_arrow_keys_read_pixel_by_pixel_and_say_what_they_read(page, report):
-    page.goto(report.as_uri())
+    visit(page, report)
     page.focus("#depth")
     page.keyboard.press("ArrowLeft")
     assert page.text_content("#spoken").startswith("(159, 120): disparity 32.00 px")
@@ -208,7 +232,7 @@ def test_the_arrow_keys_read_pixel_by_pixel_and_say_what_they_read(page, report)
 
 
 def test_a_click_enlarges_a_picture_with_its_read_out_and_escape_puts_it_back(page, report):
-    page.goto(report.as_uri())
+    visit(page, report)
     before = page.locator("#depth").bounding_box()
     page.locator("#depth").click(position={"x": 20, "y": 20})
     large = page.locator("dialog #depth").bounding_box()
@@ -221,7 +245,7 @@ def test_a_click_enlarges_a_picture_with_its_read_out_and_escape_puts_it_back(pa
 
 
 def test_each_picture_is_enlarged_by_keyboard_and_the_focus_returns(page, report):
-    page.goto(report.as_uri())
+    visit(page, report)
     buttons = page.get_by_role("button", name="Enlarge: ")
     names = [button.get_attribute("aria-label") for button in buttons.all()]
     assert names == [f"Enlarge: {name}" for name in ("New views", "Left image", "Depth", "Confidence")]
@@ -234,7 +258,7 @@ def test_each_picture_is_enlarged_by_keyboard_and_the_focus_returns(page, report
 
 
 def test_a_finger_enlarges_a_picture_on_a_phone_which_shows_all_without_scrolling_sideways(phone, report):
-    phone.goto(report.as_uri())
+    visit(phone, report)
     assert phone.evaluate("document.documentElement.scrollWidth") <= 390
     phone.locator("#depth").tap()
     assert phone.get_by_role("dialog", name="Depth").is_visible()
@@ -244,7 +268,7 @@ def test_a_finger_enlarges_a_picture_on_a_phone_which_shows_all_without_scrollin
 
 def test_an_enlarged_picture_takes_most_of_a_phone_held_sideways(phone, report):
     phone.set_viewport_size({"width": 844, "height": 390})
-    phone.goto(report.as_uri())
+    visit(phone, report)
     phone.get_by_role("button", name="Enlarge: Depth").tap()
     # 70 % of the height, and in proportion
     box = phone.locator("#depth").bounding_box()
@@ -252,14 +276,9 @@ def test_an_enlarged_picture_takes_most_of_a_phone_held_sideways(phone, report):
 
 
 def test_the_wiggle_moves_by_itself_until_it_is_paused(page, report):
-    page.goto(report.as_uri())
+    visit(page, report)
     choose(page, "Wiggle")
-    page.evaluate(
-        "new Promise((moved) => {"
-        "  const look = () => shownFrom.position === 0.5 ? requestAnimationFrame(look) : moved();"
-        "  look();"
-        "})"
-    )
+    wait_until(page, "shownFrom.position !== 0.5")
     page.get_by_role("button", name="Pause").click()
     paused = page.evaluate("shownFrom.position")
     page.evaluate("new Promise((go) => requestAnimationFrame(() => requestAnimationFrame(go)))")
@@ -268,14 +287,14 @@ def test_the_wiggle_moves_by_itself_until_it_is_paused(page, report):
 
 
 def test_nothing_moves_by_itself_where_reduced_motion_is_asked_for(phone, report):
-    phone.goto(report.as_uri())
+    visit(phone, report)
     choose(phone, "Wiggle")
     assert phone.get_by_role("button", name="Play").is_visible()
     assert phone.evaluate("wiggling") == 0
 
 
 def test_the_anaglyph_is_shown_on_request(page, report):
-    page.goto(report.as_uri())
+    visit(page, report)
     before = shown(page, "#stage")
     choose(page, "Anaglyph")
     assert page.locator("#anaglyph").is_visible()
@@ -290,9 +309,8 @@ def test_the_3_d_view_starts_as_the_left_image_and_turns_about_the_middle_of_the
 ):
     """The wall is a plane at the distance about which it turns, so each view is a homography of it."""
     page.emulate_media(reduced_motion="reduce")
-    page.goto(report.as_uri())
-    choose(page, "3-D")
-    page.wait_for_selector("#mesh")
+    visit(page, report)
+    choose_3_d(page)
     left = photograph[:, :-SHIFT_PX]
     assert difference_from_turned(page, left, turned=0.0, away=1.0) < 4
 
@@ -332,8 +350,8 @@ def difference_from_turned(page: Page, left: np.ndarray, turned: float, away: fl
 
 def test_dragging_the_3_d_view_turns_it_and_does_not_enlarge_it(page, report):
     page.emulate_media(reduced_motion="reduce")
-    page.goto(report.as_uri())
-    choose(page, "3-D")
+    visit(page, report)
+    choose_3_d(page)
     box = page.locator("#mesh").bounding_box()
     page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
     page.mouse.down()
@@ -346,7 +364,7 @@ def test_dragging_the_3_d_view_turns_it_and_does_not_enlarge_it(page, report):
 
 
 def test_triangles_join_one_surface_and_leave_out_what_the_left_image_does_not_cover(page, report):
-    page.goto(report.as_uri())
+    visit(page, report)
     maps = "{ levels: [10, 11, 30, 10, 11, 30], percents: [99, 99, 99, 99, 255, 99] }"
     whole = maps.replace("255", "99")
     all_corners = [0, 3, 1, 1, 3, 4, 1, 4, 2, 2, 4, 5]
@@ -360,14 +378,14 @@ def test_triangles_join_one_surface_and_leave_out_what_the_left_image_does_not_c
 
 
 def test_a_warning_stands_above_the_pictures_as_text(page, report):
-    page.goto(report.as_uri())
+    visit(page, report)
     banner = page.locator(".banner")
     assert banner.inner_text().splitlines()[-1] == "<b>the sides are swapped</b>"
     assert banner.bounding_box()["y"] < page.locator("#stage").bounding_box()["y"]
 
 
 def test_a_link_opens_the_file_beside_the_report(page, report):
-    page.goto(report.as_uri())
+    visit(page, report)
     page.get_by_role("link", name="disparity.pfm").click()
     page.wait_for_url("**/disparity.pfm")
     assert page.inner_text("body") == "Pf"
@@ -376,7 +394,7 @@ def test_a_link_opens_the_file_beside_the_report(page, report):
 def test_opening_the_report_requests_only_its_own_file(page, report):
     requested: list[str] = []
     page.on("request", lambda request: requested.append(request.url))
-    page.goto(report.as_uri())
+    visit(page, report)
     choose(page, "Wiggle")
     choose(page, "Anaglyph")
     assert [url for url in requested if not url.startswith("data:")] == [report.as_uri()]
@@ -400,7 +418,7 @@ def test_the_report_runs_no_script_but_its_own(browser, report):
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_text_contrasts_with_its_background_by_at_least_4_5(page, report, scheme):
     page.emulate_media(color_scheme=scheme)
-    page.goto(report.as_uri())
+    visit(page, report)
     colours = page.evaluate(
         "(names) => names.map((name) => getComputedStyle(document.body).getPropertyValue(name).trim())",
         ["--text", "--quiet", "--accent", "--card", "--page", "--warn-text", "--warn"],
