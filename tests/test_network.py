@@ -16,7 +16,7 @@ import grpc
 import httpx
 import psutil
 import pytest
-from other_processes import UNMEASURED, halted
+from other_processes import UNMEASURED, halted, list_listeners
 from visitor import Visitor
 
 from stereoweave.io.images import read_image, write_image
@@ -94,18 +94,11 @@ class Watched:
 
     def part(self, name: str) -> psutil.Process:
         """Return the process of this name among all that the program started."""
-        started = psutil.Process(self.process.pid).children(recursive=True)
-        return next(process for process in started if name in " ".join(process.cmdline()))
-
-    def listeners(self) -> dict[tuple[str, int], str]:
-        """Return the addresses on which the program and its children listen, with the process names."""
-        tree = psutil.Process(self.process.pid)
-        return {
-            tuple(connection.laddr): process.name()
-            for process in (tree, *tree.children(recursive=True))
-            for connection in process.net_connections("tcp")
-            if connection.status == psutil.CONN_LISTEN
-        }
+        for process in psutil.Process(self.process.pid).children(recursive=True):
+            with suppress(psutil.NoSuchProcess):
+                if name in " ".join(process.cmdline()):
+                    return process
+        raise LookupError(name)
 
 
 @contextmanager
@@ -177,7 +170,7 @@ def seen(tmp_path_factory) -> Seen:
             with halted(programs["batch"].part("MapWorker")):  # it would keep a core busy
                 ask_for(0.8 * ALIVE_S, Visitor(client), service, small)
             ask_for(0.2 * ALIVE_S, Visitor(client), service, small)
-        listeners = programs["service"].listeners()
+        listeners = list_listeners(programs["service"].process.pid)
         opened = [port for address, port in listeners if not is_loopback(address)]
         answers = {port: ask_without_token(port) for port in opened}
     outside = {name: calls_outside(program.trace) for name, program in programs.items()}

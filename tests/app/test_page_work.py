@@ -108,8 +108,7 @@ def endless_video(tmp_path_factory) -> Path:
 
 def workers_of(pid: int) -> set[int]:
     """Return the process IDs of a server's children."""
-    tasks = Path(f"/proc/{pid}/task").glob("*/children")
-    return {int(child) for task in tasks for child in task.read_text().split()}
+    return {child.pid for child in psutil.Process(pid).children()}
 
 
 def worker_at_work(pid: int) -> psutil.Process:

@@ -44,6 +44,18 @@ def list_processes(process: int) -> list[int]:
     return found
 
 
+def list_listeners(process: int) -> dict[tuple[str, int], str]:
+    """Return the addresses on which the process and its descendants listen, with the processes' names."""
+    found = {}
+    for pid in list_processes(process):
+        with suppress(psutil.NoSuchProcess):
+            each = psutil.Process(pid)
+            for connection in each.net_connections("tcp"):
+                if connection.status == psutil.CONN_LISTEN:
+                    found[tuple(connection.laddr)] = each.name()
+    return found
+
+
 def find_free_ports(count: int) -> list[int]:
     """Return unused ports of this machine."""
     with ExitStack() as stack:

@@ -12,13 +12,7 @@ import time
 from pathlib import Path
 
 import httpx
-
-
-def list_descendants(pid: int) -> list[int]:
-    """Return all descendants of a process."""
-    tasks = Path(f"/proc/{pid}/task").glob("*/children")
-    direct = [int(child) for task in tasks for child in task.read_text().split()]
-    return direct + [child for each in direct for child in list_descendants(each)]
+from other_processes import list_processes
 
 
 def measure_megabytes(pid: int) -> float:
@@ -36,7 +30,7 @@ def watch(url: str, pid: int) -> dict[str, list[float]]:
 
     def measure() -> None:
         while not ended.wait(1):
-            megabytes.append(sum(map(measure_megabytes, [pid, *list_descendants(pid)])))
+            megabytes.append(sum(map(measure_megabytes, list_processes(pid))))
 
     def ask() -> None:
         alone = httpx.Limits(max_keepalive_connections=0)

@@ -17,12 +17,11 @@ from typing import Any, NamedTuple
 
 import httpx
 import numpy as np
-import psutil
 import pytest
 import watching
 from hostile_calibrations import HOSTILE
 from hostile_requests import make_hostile_requests
-from other_processes import MEASURED_ALONE, UNMEASURED
+from other_processes import MEASURED_ALONE, UNMEASURED, list_listeners, list_processes
 from prometheus_client import Metric
 from prometheus_client.parser import text_string_to_metric_families
 from ray.exceptions import RayActorError
@@ -76,12 +75,12 @@ def run_serve_command(uploads: Path, *words: object) -> Iterator[Running]:
     try:
         with process.stdout:
             url = re.search(r"http://[\d.:]+", process.stdout.readline())[0]
-            started = set(watching.list_descendants(process.pid))
+            started = set(list_processes(process.pid))
             # Each request has its own connection, like requests of different clients.
             alone = httpx.Limits(max_keepalive_connections=0)
             with httpx.Client(base_url=url, timeout=60, limits=alone) as client:
                 yield Running(client, process.pid, uploads)
-            started |= set(watching.list_descendants(process.pid))
+            started |= set(list_processes(process.pid))
             process.send_signal(signal.SIGTERM)
             assert process.wait(30) == 0
             assert not wait_for_end(started, within_s=10)
@@ -319,13 +318,11 @@ def test_rays_own_exporter_has_the_metrics_of_the_replicas(running):
 
 def read_ray_metrics(pid: int) -> dict[str, Metric]:
     """Return the metrics of Ray's exporter, which listens on one of the ports that the service opens."""
-    for process in psutil.Process(pid).children(recursive=True):
-        for connection in process.net_connections("tcp"):
-            if connection.status == psutil.CONN_LISTEN:
-                with suppress(httpx.HTTPError):
-                    text = httpx.get(f"http://127.0.0.1:{connection.laddr.port}/metrics", timeout=2).text
-                    if "ray_serve_actual_batch_size" in text:
-                        return parse_metrics(text)
+    for _, port in list_listeners(pid):
+        with suppress(httpx.HTTPError):
+            text = httpx.get(f"http://127.0.0.1:{port}/metrics", timeout=2).text
+            if "ray_serve_actual_batch_size" in text:
+                return parse_metrics(text)
     return {}
 
 

@@ -9,6 +9,7 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
+import psutil
 import pytest
 
 from stereoweave.system.child_process import ChildProcess, ProcessDiedError
@@ -27,9 +28,10 @@ def _sleep_then_make(seconds: float):
 
 def wait_for_end(pid: int) -> None:
     deadline_s = time.monotonic() + 10
-    while Path(f"/proc/{pid}").exists() and "Z" not in Path(f"/proc/{pid}/stat").read_text():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.01)
+    with suppress(psutil.NoSuchProcess):
+        while psutil.Process(pid).status() != psutil.STATUS_ZOMBIE:
+            assert time.monotonic() < deadline_s
+            time.sleep(0.01)
 
 
 @pytest.fixture
