@@ -259,14 +259,23 @@ def test_removed_temporary_folders_are_made_again_and_a_failure_to_make_one_is_r
     for folder in running.uploads.glob("stereoweave-service-*/"):
         shutil.rmtree(folder)
     assert post(running.client, "/disparity").status_code == 200
+    with without_a_folder(running):
+        refused = post(running.client, "/disparity")
+    assert refused.status_code == 503
+    assert refused.json()["detail"].startswith("the service could not store or process the request (")
+    assert post(running.client, "/disparity").status_code == 200
+
+
+@contextmanager
+def without_a_folder(running: Running) -> Iterator[None]:
+    """Let the service lack a temporary folder during the block, so that it refuses each pair."""
     [measuring] = running.uploads.glob("stereoweave-service-*/measuring")
     measuring.rmdir()
     measuring.touch()
-    refused = post(running.client, "/disparity")
-    assert refused.status_code == 503
-    assert refused.json()["detail"].startswith("the service could not store or process the request (")
-    measuring.unlink()
-    assert post(running.client, "/disparity").status_code == 200
+    try:
+        yield
+    finally:
+        measuring.unlink()
 
 
 def test_the_openapi_description_names_every_path_and_field(service):
@@ -292,7 +301,11 @@ def parse_metrics(text: str) -> dict[str, Metric]:
     return {family.name: family for family in text_string_to_metric_families(text)}
 
 
-def test_the_metrics_count_requests_by_status(service):
+def test_the_metrics_count_requests_by_status(running):
+    service = running.client
+    assert post(service, "/disparity").status_code == 200
+    with without_a_folder(running):
+        assert post(service, "/disparity").status_code == 503
     assert post(service, "/depth").status_code == 422  # no camera
     with pytest.raises(httpx.ReadTimeout):  # the client disconnects
         service.post("/view", files=BOTH, timeout=httpx.Timeout(60, read=0.05))
@@ -310,10 +323,19 @@ def test_the_metrics_count_requests_by_status(service):
 
 def test_rays_own_exporter_has_the_metrics_of_the_replicas(running):
     deadline_s = time.monotonic() + 30
-    while not (families := read_ray_metrics(running.pid)) and time.monotonic() < deadline_s:
-        time.sleep(0.2)
-    batches = {s.labels.get("le"): s.value for s in families["ray_serve_actual_batch_size"].samples}
-    assert batches["+Inf"] > batches["1.0"]  # some batches held two pairs
+    while not (several := count_batches_of_two(running.pid)) and time.monotonic() < deadline_s:
+        with ThreadPoolExecutor(2) as pool:
+            list(pool.map(lambda _: post(running.client, "/disparity"), range(2)))
+    assert several
+
+
+def count_batches_of_two(pid: int) -> float:
+    """Return how many batches held two pairs, by Ray's exporter; 0 if it does not know of any batch yet."""
+    sizes = read_ray_metrics(pid).get("ray_serve_actual_batch_size")
+    if sizes is None:
+        return 0
+    batches = {sample.labels.get("le"): sample.value for sample in sizes.samples}
+    return batches["+Inf"] - batches["1.0"]
 
 
 def read_ray_metrics(pid: int) -> dict[str, Metric]:
