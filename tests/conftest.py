@@ -149,8 +149,13 @@ def without_shape_checks(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="session")
 def ray_address(s3: str) -> Iterator[str]:
     """Yield the address, for `--address`, of a Ray cluster with 2 CPUs that can reach the S3 server."""
-    # As if each start of a proxy of Ray Serve were slow; the service must wait for it nevertheless.
-    with ray_head(cpus=2, RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S="0.1") as address:
+    variables = {
+        # As if each start of a proxy of Ray Serve were slow; the service must wait for it nevertheless.
+        "RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S": "0.1",
+        # A replica that fails to start is not started a second time, which takes long.
+        "RAY_SERVE_MAX_PER_REPLICA_RETRY_COUNT": "1",
+    }
+    with ray_head(cpus=2, **variables) as address:
         yield address
 
 
