@@ -137,11 +137,11 @@ def write_many_pairs(folder: Path) -> Path:
 
 @dataclass(frozen=True)
 class Seen:
-    """Connections to other computers by program, addresses of page and service, and answers of open ports."""
+    """Connections to other computers by program, the page's printed address, listeners, and their answers."""
 
     outside: dict[str, list[str]]
     page: str
-    listeners: dict[tuple[str, int], str]
+    listeners: dict[str, dict[tuple[str, int], str]]
     answers: dict[int, grpc.StatusCode]
 
 
@@ -170,8 +170,8 @@ def seen(tmp_path_factory) -> Seen:
             with halted(programs["batch"].part("MapWorker")):  # it would keep a core busy
                 ask_for(0.8 * ALIVE_S, Visitor(client), service, small)
             ask_for(0.2 * ALIVE_S, Visitor(client), service, small)
-        listeners = list_listeners(programs["service"].process.pid)
-        opened = [port for address, port in listeners if not is_loopback(address)]
+        listeners = {name: list_listeners(programs[name].process.pid) for name in ("page", "service")}
+        opened = [port for address, port in listeners["service"] if not is_loopback(address)]
         answers = {port: ask_without_token(port) for port in opened}
     outside = {name: calls_outside(program.trace) for name, program in programs.items()}
     return Seen(outside, page, listeners, answers)
@@ -201,7 +201,9 @@ def test_a_program_makes_no_dns_query_and_connects_only_to_this_computer(seen, p
 
 
 def test_the_page_listens_on_the_address_that_its_command_prints(seen):
-    assert seen.page.startswith("http://127.1:")  # the name given by --host
+    name, port = seen.page.removeprefix("http://").split(":")
+    assert name == "127.1"  # as given by --host
+    assert list(seen.listeners["page"]) == [("127.0.0.1", int(port))]
 
 
 def test_a_dns_query_is_detected_and_a_connection_to_this_computer_is_not(tmp_path):
@@ -215,7 +217,8 @@ def test_a_dns_query_is_detected_and_a_connection_to_this_computer_is_not(tmp_pa
 
 
 def test_the_service_listens_on_loopback_but_for_one_port_that_wants_the_token(seen):
-    assert len(seen.listeners) > 10
-    (opened,) = [name for (address, _), name in seen.listeners.items() if not is_loopback(address)]
+    listeners = seen.listeners["service"]
+    assert len(listeners) > 10
+    (opened,) = [name for (address, _), name in listeners.items() if not is_loopback(address)]
     assert opened.startswith("ray::ServeReplica")
     assert list(seen.answers.values()) == [grpc.StatusCode.UNAUTHENTICATED]
