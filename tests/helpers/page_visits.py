@@ -35,11 +35,11 @@ class Visit:
         self.page.locator("#find").wait_for()
 
     def give(self, **files: Path) -> None:
-        """Put files into the fields of these names."""
+        """Put files into the fields of these names, and wait until the server has them."""
         for field, file in files.items():
             part = self.page.locator(f"#{field.replace('_', '-')}")
             part.locator("input[type=file]").set_input_files(file)
-            part.get_by_text(file.name.rsplit(".", 1)[0]).first.wait_for()
+            part.get_by_label("Clear").wait_for()
 
     def take_back(self) -> None:
         """Clear the fields for pictures."""
