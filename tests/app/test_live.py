@@ -304,7 +304,6 @@ def test_a_looped_video_begins_again_at_its_end(tmp_path):
             assert moment is not None
             seen.append((moment.number, number_of(moment.pictures[0])))
             last = moment.number
-    assert len(seen) > 3
     assert all(grey == number % 3 for number, grey in seen)
 
 
