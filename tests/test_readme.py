@@ -203,7 +203,8 @@ def test_the_commands_for_a_user_s_own_pictures_run(tmp_path):
     assert "no defects: the pair is rectified" in printed
     assert "(68 %)" in printed
     assert {"cloud.ply", "mesh.glb", "depth.png"} < {path.name for path in (tmp_path / "points").iterdir()}
-    assert sorted(path.name for path in (tmp_path / "rows").iterdir()) == ["left.png", "right.png"]
+    names = ["left.png", "rectified.json", "right.png"]
+    assert sorted(path.name for path in (tmp_path / "rows").iterdir()) == names
     for folder in ("many", "many_more"):
         assert (tmp_path / folder / "1" / "disparity.pfm").is_file()
         assert (tmp_path / folder / "summary.csv").read_text().count("\n") == 2

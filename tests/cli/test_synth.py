@@ -145,7 +145,7 @@ def test_the_costs_of_the_effects_are_printed_in_milliseconds(monkeypatch, capsy
         ("synth make pylon --pairs 1 --size 99999x32 -o set", "--size: expected 32 to 4096 px per side"),
         ("synth make pylon --pairs 1 --size ６４x４８ -o set", "--size: expected width x height"),
         ("synth make pylon --pairs 1 --view 2.1 -o set", "--view: expected positions from -1.0 to 2.0 "),
-        ("synth make pylon --pairs 1 --view 0.5 --view 0.5 -o set", "--view: expected positions that differ"),
+        ("synth make pylon --pairs 1 --view 0.5 --view 0.5 -o set", "--view: expected different positions"),
         ("synth make pylon --pairs 1 --rig 0 0.2 -o set", "focal_px: expected a number above 1e-09, found 0"),
         ("synth make pylon --pairs 1 --layout zip -o set", "--layout: expected one of shards, paper"),
         ("synth make pylon --pairs 1 -o file/set", "file/set: expected a writable folder"),

@@ -116,7 +116,7 @@ def test_a_recipe_without_worlds_is_a_one_line_error(recipe, changes, told):
 
 
 def test_a_run_of_other_pairs_and_equal_names_are_one_line_errors(recipe, run):
-    other = replace(recipe, validation_pairs=recipe.validation_pairs + 1)
+    other = replace(recipe, root="elsewhere")
     assert "tiny: expected a run with the held-out pairs of tiny" in complaint(
         lambda: list(score_worlds(other, [run]))
     )
