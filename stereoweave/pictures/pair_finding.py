@@ -193,7 +193,7 @@ def find_pairs_among(folder: str | Path, paths: Iterable[str]) -> Listed:
         calibration = beside if beside in calibrations and _owns_calibration(left, 2) else None
         pairs.append(ListedPair(_name_pair(left, 2, whole), (left, right), calibration))
     films = [ListedPair(_sanitize(path), (path,)) for path in sorted(files["film"])]
-    _check_names((pair.name, pair.files[0]) for pair in chain(pairs, films))
+    _check_names((pair.name, pair.files) for pair in chain(pairs, films))
     return Listed(pairs, films, rest)
 
 
@@ -245,7 +245,8 @@ def find_pairs_by_globs(left: str, right: str) -> list[NamedPair]:
     for path, partner in zip(lefts, partners, strict=True):
         if partner is None:
             raise StereoweaveError(
-                f"{path}: expected a right picture of this name among those that match {right}, found none",
+                f"{path}: expected a right picture of this name among those that match {right}, as "
+                f"{len(list(filter(None, partners)))} of {len(lefts)} left pictures have, found none",
                 remedy=Remedy("add it, or list the pairs in a file", ("listed",)),
             )
         pairs.append((path, partner))
@@ -381,7 +382,7 @@ def _make_pairs(
         # Not Path.exists, which raises an error if a name is too long.
         is_own = _owns_calibration(below, len(paths)) and os.path.exists(beside)  # noqa: PTH110
         pairs.append(NamedPair(name, paths, beside if is_own else None))
-    _check_names((pair.name, pair.pictures[0]) for pair in pairs)
+    _check_names((pair.name, pair.pictures) for pair in pairs)
     return pairs
 
 
@@ -396,18 +397,18 @@ def _path_below(above: Path, path: Path) -> str:
     return path.relative_to(above if path.is_relative_to(above) else path.anchor).as_posix()
 
 
-def _check_names(names: Iterable[tuple[str, str | Path]]) -> None:
-    """Raise a StereoweaveError if two pairs have the same name.
-
-    `names` gives the name and the first file of each pair.
-    """
-    seen: dict[str, str | Path] = {}
-    for name, file in names:
+def _check_names(names: Iterable[tuple[str, Sequence[str | Path]]]) -> None:
+    """Raise a StereoweaveError if two pairs have the same name; `names` gives the name and files of each."""
+    seen: dict[str, Sequence[str | Path]] = {}
+    for name, files in names:
         # Some file systems ignore case.
-        other = seen.setdefault(name.casefold(), file)
-        if other is not file:
+        others = seen.setdefault(name.casefold(), files)
+        if others is not files:
+            unlike = (both for both in zip(others, files, strict=False) if both[0] != both[1])
+            first, second = next(unlike, (others[0], files[0]))
             raise StereoweaveError(
-                f"expected pairs with different names, found {name} for both {other} and {file}; rename one",
+                f"expected pairs with different names, found {name} for both {first} and {second}; "
+                "rename one",
                 remedy=Remedy("or name them in the third column of a list", ("listed",)),
             )
 

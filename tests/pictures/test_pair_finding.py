@@ -268,12 +268,18 @@ def test_globs_are_paired_by_their_names_without_marks_if_any_of_these_agree(tmp
     }
 
 
+def test_a_second_file_of_one_side_is_refused_by_name(tmp_path):
+    folder = put(tmp_path, "a_L.png", "a_R.png", "a_R.jpg")
+    with pytest.raises(StereoweaveError, match="different names, found a for both a_R.jpg and a_R.png"):
+        find_pairs_in(folder)
+
+
 def test_a_picture_of_a_glob_without_partner_is_refused_with_what_to_give(tmp_path):
     folder = put(tmp_path, *(f"{number}_L.png" for number in "123"), *(f"{number}_R.png" for number in "234"))
     with pytest.raises(
         StereoweaveError,
         match=r"1_L.png: expected a right picture of this name among those that match .*/\*_R.png, "
-        r"found none; add it, or list the pairs in a file \(listed\)$",
+        r"as 2 of 3 left pictures have, found none; add it, or list the pairs in a file \(listed\)$",
     ):
         find_pairs_by_globs(f"{folder}/*_L.png", f"{folder}/*_R.png")
 
