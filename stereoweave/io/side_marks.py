@@ -17,7 +17,7 @@ _MARKS = (
         r"|^[lLrR](?=$|[ _.-])|(?<![A-Za-z])[lLrR]$|^im[01]$"
     ),
     re.compile(r"(?<![A-Za-z])(?:cam|Cam|CAM)[01](?![A-Za-z0-9])"),
-    re.compile(r"(?<=[ _.-])[lLrR](?=[ _.-])"),
+    re.compile(r"(?<![A-Za-z])[lLrR](?=[0-9 _.-])"),
 )
 
 

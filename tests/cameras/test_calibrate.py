@@ -171,6 +171,7 @@ def test_pairs_of_another_size_than_most_are_left_out(copied):
         ("cam0/{}.png", "cam1/{}.png"),
         ("imgLeft{}.png", "imgRight{}.png"),
         ("board_l_{}.png", "board_r_{}.jpg"),
+        ("L{}.png", "R{}.png"),
     ],
 )
 def test_pairs_are_known_by_their_names(tmp_path, names):
