@@ -24,8 +24,8 @@ def replacing_together(
         out: Folder of the result; made if it is missing.
         names: All files that a result can have.
         written: The files that this result has. One that exists without an earlier result is an error.
-        marks: The files by which an earlier result is recognised: it has them all. None for a folder in which
-            all files are of earlier results.
+        marks: The files by which an earlier result is recognised: it has the first and, if there are more,
+            one of the others. Empty for a folder in which all files are of earlier results.
 
     Raises:
         OutputInUseError: Another process writes to `out`.
@@ -39,7 +39,8 @@ def replacing_together(
         # Without the lock, two commands could leave a mixture of their files.
         with lock_output(make_folder(out)):
             is_earlier_result = _has_result(out, marks)
-            for name in names:
+            # The marks first, so that a result is recognised even if this process is killed in between.
+            for name in sorted(names, key=lambda name: name not in marks):
                 fresh = Path(folder, name)
                 if fresh.exists():
                     fresh.replace(out / name)
@@ -48,7 +49,8 @@ def replacing_together(
 
 
 def _has_result(out: Path, marks: Sequence[str]) -> bool:
-    return all((out / name).exists() for name in marks)
+    there = [(out / name).exists() for name in marks]
+    return not there or (there[0] and (len(there) == 1 or any(there[1:])))
 
 
 def _refuse_others(out: Path, written: Sequence[str]) -> None:

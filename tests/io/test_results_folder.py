@@ -55,6 +55,13 @@ def test_a_users_own_file_is_not_replaced(tmp_path, name):
     assert read_all(tmp_path) == {name: "own"}
 
 
+def test_a_result_is_recognised_by_its_first_mark_and_one_of_the_others(tmp_path):
+    write_result(tmp_path, {"map.pfm": "1", "map.png": "1", "notes.json": "1"}, marks=NAMES)
+    (tmp_path / "map.png").unlink()
+    write_result(tmp_path, {"map.pfm": "2"}, marks=NAMES)
+    assert read_all(tmp_path) == {"map.pfm": "2"}
+
+
 def test_in_a_folder_of_results_alone_all_their_files_are_replaced(tmp_path):
     (tmp_path / "map.png").write_text("1")
     write_result(tmp_path, {"map.pfm": "2"}, marks=())
