@@ -100,8 +100,9 @@ def _to_eight_bits(values: Shaped[np.ndarray, "..."], name: str) -> UInt8[np.nda
     if values.dtype.kind == "u" and values.dtype.itemsize == 2:
         if values.size and 0 < values.max() < LEAST_OF_SIXTEEN_BITS:
             raise StereoweaveError(
-                f"{name}: expected uint16 values that use 0..65535, got {got} up to {values.max()}, which is "
-                "nearly black; multiply values of 12 bits by 16, of 10 bits by 64"
+                f"{name}: expected uint16 values that use 0..65535, got {got} up to {values.max()}; "
+                "multiply values of 12 bits by 16, of 10 bits by 64, or, if the image is so dark, give "
+                "(image >> 8).astype('uint8')"
             )
         return (values >> 8).astype(np.uint8)
     if values.dtype.kind != "f":
