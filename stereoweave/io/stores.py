@@ -4,6 +4,7 @@ Endpoint, region and keys come from the environment and the provider's own files
 ~/.aws/credentials. The store's library retries requests that fail with "slow down" or a server error.
 """
 
+import errno
 import importlib
 import os
 import re
@@ -341,9 +342,14 @@ def _list_entries(folder: Path) -> list[os.DirEntry[str]]:
 
 def _read_status(entry: os.DirEntry[str]) -> os.stat_result | None:
     """Return the status of a file; None if the entry is not a file that can be reached."""
-    with suppress(OSError):  # such as one that has just been removed, or a link to itself
+    try:
         return entry.stat() if entry.is_file() else None
-    return None
+    except FileNotFoundError:  # it has just been removed
+        return None
+    except OSError as error:
+        if error.errno != errno.ELOOP:  # a link to itself
+            raise
+        return None
 
 
 def _list_s3(library: "AsyncFileSystem", folder: str) -> Iterator[StoredFile]:
