@@ -313,9 +313,15 @@ def check_unpacked(name: str, format: str | None) -> None:
 
 
 def _find_pixel_aspect(split: PairLayout | InterleavedLayout | None, stated: Fraction) -> Fraction:
-    """Return the pixel aspect of views at full size; some files state that of the squeezed views."""
-    if isinstance(split, PairLayout) and split.half and stated == (2 if split.beside else Fraction(1, 2)):
-        return Fraction(1)
+    """Return the pixel aspect of views at full size.
+
+    Some files state another one: of half size, that of the squeezed views; of full size, that by which a flat
+    screen shows both views in the shape of one.
+    """
+    if isinstance(split, PairLayout):
+        squeezed = Fraction(2) if split.beside else Fraction(1, 2)
+        if stated == (squeezed if split.half else 1 / squeezed):
+            return Fraction(1)
     return stated
 
 

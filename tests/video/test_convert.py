@@ -83,6 +83,8 @@ def aspect_of(video: Path) -> Fraction | None:
         ("side_by_side", Fraction(4, 3), 0, Fraction(4, 3)),
         ("top_bottom", Fraction(4, 3), 90, Fraction(3, 4)),  # of the upright picture
         ("side_by_side_half", Fraction(4, 3), 0, Fraction(4, 3)),
+        ("side_by_side", Fraction(1, 2), 0, None),  # 1/2 is that of both views in the shape of one
+        ("top_bottom", Fraction(2), 0, None),
         ("side_by_side_half", Fraction(2), 0, None),  # 2 is that of the squeezed views
         ("top_bottom_half", Fraction(1, 2), 0, None),
         ("side_by_side", None, 0, None),
