@@ -12,7 +12,7 @@ from stereoweave.cameras.sphere_nearness import MatchedWindow, spread_nearness
 from stereoweave.cameras.sphere_windows import BLIND_DEG
 from stereoweave.errors import Note, StereoweaveError
 from stereoweave.io.colormap import colour_disparity, find_colour_range_px, grey_confidence
-from stereoweave.io.files import make_parent_folder
+from stereoweave.io.files import make_parent_folder, refuse_inputs
 from stereoweave.io.images import write_image
 from stereoweave.io.maps import write_npy, write_pfm
 from stereoweave.io.results_folder import replacing_together
@@ -25,6 +25,7 @@ from stereoweave.system.steps import step
 
 FILES = ("distance.pfm", "distance.npy", "distance_preview.png", "distance_confidence.png")
 LEFT, FACTS = "panorama_left.png", "distance.json"
+_NAMES = (*FILES, LEFT, FACTS)
 _MIDDLE_PERCENT = 1, 99
 
 
@@ -100,7 +101,8 @@ def make_sphere_depth(pictures: Sequence[Path], out: Path, job: DepthJob) -> tup
             f"expected no further files for the whole field of view, found {', '.join(job.files)}",
             setting="files",
         )
-    make_parent_folder(*(out / file for file in (*FILES, LEFT, FACTS)))
+    make_parent_folder(*(out / name for name in _NAMES))
+    refuse_inputs((out / name for name in _NAMES), pictures)
     matcher = job.backend.matcher()
     prepared = prepare(pictures, job.request)
     assert prepared.sphere is not None
@@ -141,8 +143,7 @@ def _write(out: Path, found: SphereDepth, facts: SphereFacts) -> None:
     # Nearness has no pixels: scaled so that colours differ as they do for disparities.
     scaled = nearness * 1000 / max(float(nearness.max()), 1e-9)
     range_px = find_colour_range_px(scaled[known][None]) if known.any() else (0.0, 1.0)
-    names = (*FILES, LEFT, FACTS)
-    with replacing_together(out, names, names, marks=("distance.pfm", FACTS)) as folder:
+    with replacing_together(out, _NAMES, _NAMES, marks=("distance.pfm", FACTS)) as folder:
         write_pfm(folder / "distance.pfm", np.where(known, found.distance, np.inf))
         write_npy(folder / "distance.npy", found.distance)
         write_image(folder / "distance_preview.png", colour_disparity(scaled, range_px) * known[..., None])
