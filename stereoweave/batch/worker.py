@@ -321,7 +321,7 @@ def _note_unused_settings(job: DepthJob) -> list[Note]:
     given = tuple(setting for setting, is_given in for_pairs.items() if is_given)
     if not given:
         return []
-    return [Note("some settings apply to pairs only, not to this video", Remedy("leave them out", given))]
+    return [Note("some settings were not used for this video", Remedy("they apply to pairs only", given))]
 
 
 class _StoreError(StereoweaveError):

@@ -406,7 +406,7 @@ def test_a_video_is_rectified_unless_refused_and_the_row_has_its_notes(tmp_path,
 def test_the_row_of_a_video_names_the_settings_that_apply_to_pairs_only(tmp_path):
     request = Request(format="crossed", focal_px=700.0, baseline_m=0.1)
     job = DepthJob(request=request, options=MatchOptions(raw=True, range_px=(0, 64)), files=("depth.png",))
-    told = "some settings apply to pairs only, not to this video; leave them out"
+    told = "some settings were not used for this video; they apply to pairs only"
     names = "(focal_px, baseline_m, range_px, raw, files)"
     assert f"{told} {names}" in checks_of_video(tmp_path, job)
 
