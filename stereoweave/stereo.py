@@ -253,9 +253,10 @@ def check_fits(estimate: Estimate, pair: StereoPair) -> None:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class View:
-    """Synthesised image, uint8 RGB [H, W, 3]; `drawn`, bool [H, W], is True at pixels that a camera saw.
+    """Synthesised image, uint8 RGB [H, W, 3], and the mask `drawn`, bool [H, W].
 
-    It is False where part of the colour may come from a border without content (`StereoPair.left_seen`).
+    `drawn` is False at filled holes, which no camera saw, and where part of the colour may come from a border
+    without content (`StereoPair.left_seen`).
     """
 
     image: UInt8[np.ndarray, "h w 3"]

@@ -160,8 +160,8 @@ class ViewFile:
         view = renderer.view(self.position, up=self.up, forward=self.forward)
         image = _cut(view.image, part)
         write_image(self.path, image)
-        unseen_percent = 100 * (~view.drawn[part]).mean()
-        text = f"view at {self.position:g}, {unseen_percent:.1f} % of it seen by neither camera"
+        empty_percent = 100 * (~view.drawn[part]).mean()
+        text = f"view at {self.position:g}, {empty_percent:.1f} % of it holes or borders"
         return WrittenView(text, image)
 
     @step("rendering views")

@@ -91,7 +91,7 @@ def test_a_single_view_uses_strength_and_reports_the_share_that_neither_camera_s
     assert run(f"{arguments} --position 1 -o right_again.png") == 0
     np.testing.assert_array_equal(read_image("narrow.png"), pair.right)  # 0.5 + 0.5 * (1.5 - 0.5) = 1
     np.testing.assert_array_equal(read_image("right_again.png"), pair.right)
-    assert "narrow.png: view at 1.5, 0.0 % of it seen by neither camera" in capfd.readouterr().out
+    assert "narrow.png: view at 1.5, 0.0 % of it holes or borders" in capfd.readouterr().out
 
 
 def test_the_extension_of_a_file_can_select_the_layout(pair, capfd):
