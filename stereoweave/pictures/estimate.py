@@ -81,15 +81,10 @@ def estimate(  # noqa: PLR0913 - all but the images are keyword-only and optiona
             that fails, and StereoweaveError for invalid images or options.
     """
     with _keeping_own_remedies():
-        _check_alignment(align, calibration)
         options = MatchOptions(range_px=range_px, refined=refined, raw=raw)
         backend = Backend(model=model, threads=threads, provider=provider)
-        request = Request(
-            format=format,
-            calibration=None if calibration is None else Path(calibration),
-            rectify=None if align else calibration is not None,
-            sphere=_request_window(projection, look_deg, fov_deg, lens_fov_deg),
-        )
+        sphere = _request_window(projection, look_deg, fov_deg, lens_fov_deg)
+        request = _make_request(align, calibration, format, sphere)
         if right is None:
             return _match_one_file(left, backend, options, request)
         if format is not None:
@@ -154,7 +149,10 @@ def _request_window(
     return SphereRequest(projection=projection, look_deg=look, fov_deg=fov_deg, lens_fov_deg=lens_fov_deg)
 
 
-def _check_alignment(align: object, calibration: object) -> None:
+def _make_request(
+    align: object, calibration: str | Path | None, format: str | None, sphere: SphereRequest
+) -> Request:
+    """Return the request for a pair; raise StereoweaveError for a wrong or contradictory alignment."""
     if align is not None and not (isinstance(align, str) and align == "auto"):
         raise StereoweaveError(f"expected 'auto' or None, got {describe(align)}", setting="align")
     if calibration is not None:
@@ -164,6 +162,12 @@ def _check_alignment(align: object, calibration: object) -> None:
                 f"expected either a calibration or align='auto', found both, {calibration}",
                 setting="calibration",
             )
+    return Request(
+        format=format,
+        calibration=None if calibration is None else Path(calibration),
+        rectify=None if align else calibration is not None,
+        sphere=sphere,
+    )
 
 
 def _rectify(pair: StereoPair, calibration: Path) -> Rectified:
