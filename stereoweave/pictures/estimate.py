@@ -87,8 +87,6 @@ def estimate(  # noqa: PLR0913 - all but the images are keyword-only and optiona
         request = _make_request(align, calibration, format, sphere)
         if right is None:
             return _match_one_file(left, backend, options, request)
-        if format is not None:
-            raise StereoweaveError("expected none for two images, found one", setting="format")
         given = StereoPair(left=as_rgb(left, "left"), right=as_rgb(right, "right"))
         return _match_images(given, backend, options, request)
 
@@ -113,6 +111,8 @@ def _match_one_file(file: ImageLike, backend: Backend, options: MatchOptions, re
 
 def _match_images(given: StereoPair, backend: Backend, options: MatchOptions, request: Request) -> Estimate:
     """Match two images, or a window of them; rectify or align them first if asked for."""
+    if request.format is not None:
+        raise StereoweaveError("expected none for two images, found one", setting="format")
     matcher = backend.matcher()
     chosen = request.sphere.choose("two images", None)
     if request.calibration:

@@ -129,8 +129,7 @@ def write_video(
     times_ms = times_ms if times_ms is not None else [FRAME_MS * index for index in range(len(frames))]
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=Fraction(1000, FRAME_MS))
-        height_px, width_px = frames[0].shape[:2]
-        stream.width, stream.height = width_px, height_px
+        stream.height, stream.width = frames[0].shape[:2]
         stream.pix_fmt = pix_fmt or _likes_best(codec)
         stream.codec_context.time_base = Fraction(1, 1000)
         stream.codec_context.colorspace = colorspace
