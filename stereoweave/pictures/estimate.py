@@ -22,6 +22,7 @@ from stereoweave.matching.backend import Backend
 from stereoweave.matching.estimate import match
 from stereoweave.matching.options import MatchOptions
 from stereoweave.matching.providers import CPU
+from stereoweave.pictures.loading import open_two
 from stereoweave.pictures.panoramas import SphereView, cut_pair
 from stereoweave.pictures.prepare import Request, prepare
 from stereoweave.stereo import Estimate, StereoPair
@@ -87,6 +88,8 @@ def estimate(  # noqa: PLR0913 - all but the images are keyword-only and optiona
         request = _make_request(align, calibration, format, sphere)
         if right is None:
             return _match_one_file(left, backend, options, request)
+        if isinstance(left, str | Path) and isinstance(right, str | Path):
+            return _match_two_files(Path(left), Path(right), backend, options, request)
         given = StereoPair(left=as_rgb(left, "left"), right=as_rgb(right, "right"))
         return _match_images(given, backend, options, request)
 
@@ -107,6 +110,18 @@ def _match_one_file(file: ImageLike, backend: Backend, options: MatchOptions, re
     elif request.calibration:
         notes += _note_units(prepared.pair)
     return replace(found, pair=prepared.pair, notes=notes)
+
+
+def _match_two_files(
+    left: Path, right: Path, backend: Backend, options: MatchOptions, request: Request
+) -> Estimate:
+    """Match the pair in two files."""
+    opened = open_two(left, right, panorama=request.sphere.projection is not None)
+    found = _match_images(opened.pair, backend, options, request)
+    notes = (*_fit_to_python(opened.notes), *found.notes)
+    # A file may be turned by the other's EXIF tag; callers that read it alone would get another pair.
+    changed = opened.pair if opened.notes else None
+    return replace(found, pair=found.pair or changed, notes=notes)
 
 
 def _match_images(given: StereoPair, backend: Backend, options: MatchOptions, request: Request) -> Estimate:

@@ -106,7 +106,7 @@ def open_pictures(
                     setting="format",
                 )
             panorama = sphere.projection is not None
-            return _show_window(str(left), _open_two(left, right, panorama=panorama), sphere)
+            return _show_window(str(left), open_two(left, right, panorama=panorama), sphere)
         case [both]:
             return _show_window(str(both), _open_one(both, format, sphere), sphere)
     names = " ".join(map(str, paths))
@@ -189,7 +189,8 @@ def _show_window(name: str, opened: Opened, sphere: SphereRequest) -> Opened:
     )
 
 
-def _open_two(left: Path, right: Path, *, panorama: bool) -> Opened:
+def open_two(left: Path, right: Path, *, panorama: bool) -> Opened:
+    """Open two pictures whole, also those of a `panorama`. Raises FormatError, as `open_pictures` does."""
     decoded = [read_picture(path, panorama=panorama) for path in (left, right)]
     lies, notes = _choose_orientations(*decoded)
     eyes = [each.upright(lie) for each, lie in zip(decoded, lies, strict=True)]

@@ -5,6 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 import stereoweave as sw
 from stereoweave.cameras.calibration_files import read_rig, write_rig
@@ -79,6 +80,31 @@ def test_the_estimate_says_which_problems_remain(example):
     (doubtful,) = sw.estimate(plain, plain, align="auto").notes
     assert str(doubtful).endswith("not be rectified; give pictures that are rectified by a calibration")
     assert sw.estimate(example.left, example.left).notes == ()
+
+
+def test_two_files_are_opened_with_their_notes_as_the_command_opens_them(example, estimate, tmp_path):
+    paths = [tmp_path / "left.png", tmp_path / "right.png"]
+    right_side_up = Image.Exif()
+    right_side_up[0x0112] = 3  # the camera hung upside down
+    for path, view, tags in zip(
+        paths, (example.left, example.right), (right_side_up, Image.Exif()), strict=True
+    ):
+        Image.fromarray(view[::-1, ::-1]).save(path, exif=tags)
+    found = sw.estimate(*paths)
+    assert "the only EXIF orientation" in str(found.notes[0])
+    np.testing.assert_array_equal(found.disparity_px, estimate.disparity_px)
+    np.testing.assert_array_equal(sw.render(*paths, found, 0.0).image, example.left)
+
+
+def test_files_of_twelve_bits_in_sixteen_are_noted(example, tmp_path):
+    paths = [tmp_path / "left.png", tmp_path / "right.png"]
+    for path, view in zip(paths, (example.left, example.right), strict=True):
+        Image.fromarray(view[..., 0].astype(np.uint16) * 16).save(path)
+    notes = sw.estimate(*paths).notes
+    assert [str(note).partition(": 16 bits")[0] for note in notes] == [
+        "left picture: nearly black",
+        "right picture: nearly black",
+    ]
 
 
 def test_a_note_advises_what_the_function_can_do(example):
