@@ -41,6 +41,8 @@ _RESULTS = {
 _VIEW = re.compile(
     r"(.+)_(?:view|side_by_side|crossed|top_bottom|anaglyph|rgbd|quilt|contact_sheet|sweep|wiggle)(?:_[^/]*)?"
 )
+# The file that every result of `rectify` has, and what the folder adds to the name of the left picture.
+_RECTIFIED_FILE, _RECTIFIED = "rectified.json", "_rectified"
 _NOT_IN_NAMES = re.compile(r'[<>:"/\\|?*\x00-\x1f]')
 # Names of Windows devices, and of a batch's own files and folders.
 _TAKEN = re.compile(
@@ -168,7 +170,7 @@ def find_pairs_among(folder: str | Path, paths: Iterable[str]) -> Listed:
     read. A file with both views is also a pair. A camera raw file counts only if no picture beside it has its
     name. If there is no such pair or file, every picture is taken to hold both views. A calib.txt beside
     left.png, im0.png or cam0.png belongs to that pair. Output folders of batches, the files of a single
-    result and views of a pair beside its left picture are ignored.
+    result, and views of a pair and its rectified pictures beside its left picture are ignored.
 
     Args:
         folder: Path or URL of the folder; a pair whose name consists only of marks is named after the folder.
@@ -182,8 +184,9 @@ def find_pairs_among(folder: str | Path, paths: Iterable[str]) -> Listed:
     pictures = [*files["picture"], *_find_undeveloped(files["raw"], files["picture"])]
     halves, doubles = pair_by_marks(pictures), files["both views"]
     views = _find_views(halves, pictures)
-    halves = [pair for pair in halves if views.isdisjoint(pair)]
-    rest = sorted(set(pictures).difference(views, chain.from_iterable(halves)))
+    rectified = _find_rectified(halves, files[_RECTIFIED_FILE])
+    halves = [pair for pair in halves if views.isdisjoint(pair) and pair not in rectified]
+    rest = sorted(set(pictures).difference(views, chain.from_iterable((*halves, *rectified))))
     if not (halves or doubles):
         doubles, rest = rest, []
     whole, calibrations = _absolute(folder).name, set(files[_CALIBRATION])
@@ -304,7 +307,7 @@ def _list_endings() -> str:
 
 def _group_by_kind(paths: Iterable[str]) -> dict[str, list[str]]:
     """Group listed files by kind; drop files of unknown kind and those of batches and of single results."""
-    names = (BATCH_FILE, _CALIBRATION, *_RESULTS)
+    names = (BATCH_FILE, _RECTIFIED_FILE, _CALIBRATION, *_RESULTS)
     kinds: dict[str, list[str]] = {kind: [] for kind in (*_ENDINGS, *names)}
     kind_of = {ending: kind for kind, endings in _ENDINGS.items() for ending in endings}
     kind_of |= {name: name for name in names}
@@ -341,6 +344,13 @@ def _find_views(halves: Sequence[tuple[str, str]], pictures: Sequence[str]) -> s
     lefts = {splitext(left)[0] for left, _ in whole}
     unpaired = there.difference(chain.from_iterable(whole))
     return {path for path in unpaired if (view := _VIEW.fullmatch(splitext(path)[0])) and view[1] in lefts}
+
+
+def _find_rectified(halves: Sequence[tuple[str, str]], marks: Sequence[str]) -> set[tuple[str, str]]:
+    """Return the pairs that `rectify` wrote to a folder named after the left picture of another pair."""
+    named = {splitext(left)[0] + _RECTIFIED for left, _ in halves}
+    own = named.intersection(mark.rpartition("/")[0] for mark in marks)
+    return {pair for pair in halves if pair[0].rpartition("/")[0] in own}
 
 
 def _list_parents(path: str) -> list[str]:

@@ -174,6 +174,20 @@ def test_views_of_a_pair_beside_it_are_no_pictures(layout, left):
     assert found.left_out == []
 
 
+def test_rectified_pictures_of_a_pair_beside_it_are_no_other_pair():
+    pair, made = ("a/1_L.png", "a/1_R.png"), ["left.png", "right.png", "rectified.json", "calib.yml"]
+    found = find_pairs_among("x", [*pair, *(f"a/1_L_rectified/{name}" for name in made)])
+    assert [each.files for each in found.pairs] == [pair]
+    assert found.left_out == []
+
+
+def test_rectified_pictures_are_a_pair_where_their_originals_are_not():
+    made = [f"1_L_rectified/{name}" for name in ("left.png", "right.png", "rectified.json")]
+    for others in ([], ["2_L.png", "2_R.png"]):
+        pairs = [each.files for each in find_pairs_among("x", [*made, *others]).pairs]
+        assert (made[0], made[1]) in pairs
+
+
 def test_pictures_named_like_views_are_the_user_s_where_the_rest_of_a_pair_is_found():
     files = [f"{side}{more}.png" for side in ("left", "right") for more in ("", "_view")]
     pairs = [each.files for each in find_pairs_among("x", [*files, "left_2.png", "tree_view.png"]).pairs]
