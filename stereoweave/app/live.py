@@ -11,8 +11,8 @@ from jaxtyping import Float
 
 from stereoweave.app.capture import Capture, Moment
 from stereoweave.app.screen import Screen
-from stereoweave.cameras.rectify import Rectified, rectify
-from stereoweave.cameras.rig import Rig
+from stereoweave.cameras.rectify import Rectification, Rectified, plan_rectification
+from stereoweave.cameras.rig import Rig, pair_size_px
 from stereoweave.cameras.unit_check import note_units
 from stereoweave.errors import Note
 from stereoweave.io.colormap import colour_disparity, find_colour_range_px
@@ -97,11 +97,14 @@ def show(  # noqa: PLR0913 - source, output and settings
     if capture.count == 2:
         format = None
     range_px: tuple[float, float] | None = None
+    plan: Rectification | None = None
     while moment := capture.newest(tally.last):
         if capture.count == 1 and format is None:
             format = detect_layout(capture.name, moment.pictures, capture.declared_packing)
         split = _split_pair(moment.pictures, format)
-        ready = rectify(split, rig) if rig else Rectified(pair=replace(split, camera=capture.camera))
+        if rig and not plan:
+            plan = plan_rectification(rig, pair_size_px(split))
+        ready = plan.apply(split) if plan else Rectified(pair=replace(split, camera=capture.camera))
         pair = ready.pair
         if not tally.shown:
             for note in [*capture.notes, *_note_odd_size(moment, format), *ready.notes, *_note_units(pair)]:

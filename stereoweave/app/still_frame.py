@@ -43,7 +43,7 @@ def convert_still(upload: VideoUpload, report: Callable[[float, str], None]) -> 
         StereoweaveError: See `open_upload`; or the video ends before this time.
     """
     video = open_upload(upload, report)
-    from stereoweave.video.convert import fit_to_sphere
+    from stereoweave.video.convert import fit_to_video
     from stereoweave.video.frame_converter import FrameConverter, load_matcher
     from stereoweave.video.survey import survey_video
 
@@ -51,7 +51,7 @@ def convert_still(upload: VideoUpload, report: Callable[[float, str], None]) -> 
     still = video.excerpt(start_s, float(frame_s / 2))
     report(0.3, "converting one frame")
     seen: list[ConvertedFrame] = []
-    job = replace(fit_to_sphere(make_job(upload, upload.output), still), on_converted=seen.append)
+    job = replace(fit_to_video(make_job(upload, upload.output), still), on_converted=seen.append)
     survey, notes = survey_video(
         still, load_matcher(job), Progress(disable=True), rectified=job.rectify, threads=1
     )

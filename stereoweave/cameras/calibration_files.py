@@ -83,7 +83,7 @@ def read_calibration_bytes(path: str | Path) -> bytes:
 def add_camera(pair: StereoPair, path: str | Path) -> StereoPair:
     """Return a rectified pair with the camera from a calibration file for pictures of the same size."""
     rig = read_rig(path, pair_size_px(pair))
-    rig.check_size(pair)
+    rig.check_size(pair_size_px(pair))
     return replace(pair, camera=rig.camera())
 
 

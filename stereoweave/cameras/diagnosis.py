@@ -12,6 +12,8 @@ from stereoweave.stereo import Estimate, StereoPair
 _CONFIDENT = 0.5
 # Sound pairs have at least 64 % confident pixels; noise and plain pictures have at most 12 %.
 _LEAST_CONFIDENT_PERCENT = 30.0
+CALIBRATE = Remedy("give a calibration", ("calibration",))
+CALIBRATE_AGAIN = Remedy("give a calibration of these cameras", ("calibration",))
 GIVE_DOFFS = Remedy("give a calibration with doffs", ("calibration",))
 
 

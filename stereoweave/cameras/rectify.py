@@ -1,13 +1,14 @@
 """Rectification with a calibration."""
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Shaped
 
-from stereoweave.cameras.rig import Optics, Rig, pair_size_px
+from stereoweave.cameras.rig import Optics, Rig, Size, pair_size_px
 from stereoweave.errors import Note, StereoweaveError
 from stereoweave.stereo import StereoCamera, StereoPair
 
@@ -31,8 +32,110 @@ class Rectified:
     notes: tuple[Note, ...] = ()
 
 
+class RectifiedView:
+    """Remap of the pictures of one camera to the rectified camera.
+
+    Args:
+        optics: Intrinsics of the camera.
+        turn: Rotation from the camera to the rectified one.
+        camera: The rectified camera.
+        size_px: Width and height of the pictures.
+
+    Attributes:
+        seen: Mask [H, W] of the pixels that the camera sees.
+    """
+
+    def __init__(
+        self, optics: Optics, turn: Float[np.ndarray, "3 3"], camera: StereoCamera, size_px: Size
+    ) -> None:
+        width, height = size_px
+        pinhole = np.array(
+            [[camera.focal_px, 0, camera.cx_px], [0, camera.focal_px, camera.cy_px], [0, 0, 1]]
+        )
+        places = cv2.fisheye.initUndistortRectifyMap if optics.fisheye else cv2.initUndistortRectifyMap
+        self._x_px, self._y_px = places(
+            optics.matrix, _pad_distortion(optics), turn, pinhole, size_px, cv2.CV_32FC1
+        )
+        inside = (self._x_px > -0.5) & (self._x_px < width - 0.5)
+        inside &= (self._y_px > -0.5) & (self._y_px < height - 0.5)
+        self.seen: Bool[np.ndarray, "h w"] = inside & _find_valid_field(
+            optics, turn, pinhole, (height, width)
+        )
+
+    @property
+    def size_px(self) -> Size:
+        """Width and height of the results."""
+        return self.seen.shape[1], self.seen.shape[0]
+
+    def apply(self, image: Shaped[np.ndarray, "h w 3"]) -> Shaped[np.ndarray, "h2 w2 3"]:
+        """Return a picture as the rectified camera sees it.
+
+        The border is repeated outside the picture, so that matching finds no false edge there.
+        """
+        return cv2.remap(image, self._x_px, self._y_px, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+
+    def crop(self, rows: slice, columns: slice) -> "RectifiedView":
+        """Return the remap to a rectangle of the results."""
+        part = copy.copy(self)
+        part._x_px, part._y_px = self._x_px[rows, columns], self._y_px[rows, columns]
+        part.seen = self.seen[rows, columns]
+        return part
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Rectification:
+    """Rectification of all pictures that a rig takes.
+
+    Attributes:
+        camera: Camera of the rectified pictures.
+        views: Remaps of the left and the right pictures; None if the pictures are rectified as they are.
+        notes: Notes on the rig and the rectification.
+    """
+
+    camera: StereoCamera
+    views: tuple[RectifiedView, RectifiedView] | None
+    notes: tuple[Note, ...]
+
+    def apply(self, pair: StereoPair) -> Rectified:
+        """Rectify a pair; keep the size, and add the camera."""
+        if self.views is None:
+            return Rectified(pair=replace(pair, camera=self.camera), notes=self.notes)
+        left, right = self.views
+        rectified = StereoPair(
+            left=left.apply(pair.left),
+            right=right.apply(pair.right),
+            camera=self.camera,
+            left_seen=left.seen,
+            right_seen=right.seen,
+        )
+        return Rectified(pair=rectified, notes=self.notes)
+
+    def crop(self) -> "Rectification":
+        """Return the rectification to the largest rectangle that both cameras see, of even sides."""
+        if self.views is None:
+            return self
+        left, right = self.views
+        rows, columns = (
+            slice(side.start, side.stop - (side.stop - side.start) % 2)
+            for side in _find_largest_rectangle(left.seen & right.seen)
+        )
+        return replace(
+            self,
+            camera=_crop_camera(self.camera, rows, columns),
+            views=(left.crop(rows, columns), right.crop(rows, columns)),
+        )
+
+
 def rectify(pair: StereoPair, rig: Rig) -> Rectified:
     """Rectify a pair to two parallel pinhole cameras; keep the size, and add the camera.
+
+    Raises the errors of `plan_rectification`.
+    """
+    return plan_rectification(rig, pair_size_px(pair)).apply(pair)
+
+
+def plan_rectification(rig: Rig, size_px: Size) -> Rectification:
+    """Plan the rectification of pictures of this width and height to two parallel pinhole cameras.
 
     Both cameras are rotated to a common direction, between their own directions and perpendicular to the
     baseline. The new focal length is the mean of both focal lengths, to preserve the resolution in the
@@ -44,24 +147,24 @@ def rectify(pair: StereoPair, rig: Rig) -> Rectified:
         StereoweaveError: The right camera is not to the right of the left one, or the cameras look in such
             different directions that no common view is left.
     """
-    rig.check_size(pair)
+    rig.check_size(size_px)
     _check_side_by_side(rig)
     if rig.unlike_rectified() is None:
         note = Note(f"{rig.name} is a calibration of rectified pictures, so they are left unchanged")
-        return Rectified(pair=replace(pair, camera=rig.camera()), notes=(*rig.notes, note))
+        return Rectification(camera=rig.camera(), views=None, notes=(*rig.notes, note))
     # Values that cannot be computed become NaN or infinity and are rejected later.
     with np.errstate(all="ignore"):
         turns = _find_rotations(rig)
-        camera = _choose_camera(rig, turns, pair_size_px(pair))
-    left, left_seen = _rectify_view(pair.left, rig.left, turns[0], camera)
-    right, right_seen = _rectify_view(pair.right, rig.right, turns[1], camera)
-    if not (left_seen.any() and right_seen.any()):
+        camera = _choose_camera(rig, turns, size_px)
+    left = RectifiedView(rig.left, turns[0], camera, size_px)
+    right = RectifiedView(rig.right, turns[1], camera, size_px)
+    if not (left.seen.any() and right.seen.any()):
         raise StereoweaveError(
             f"{rig.name}: expected two cameras with a common view, found that "
-            f"{'the right' if left_seen.any() else 'the left'} one does not see it; check the rotation"
+            f"{'the right' if left.seen.any() else 'the left'} one does not see it; check the rotation"
         )
-    rectified = StereoPair(left=left, right=right, camera=camera, left_seen=left_seen, right_seen=right_seen)
-    return Rectified(pair=rectified, notes=(*rig.notes, _summarize(rig, turns, rectified)))
+    note = _summarize(rig, turns, left.seen & right.seen)
+    return Rectification(camera=camera, views=(left, right), notes=(*rig.notes, note))
 
 
 def find_content(pair: StereoPair) -> tuple[slice, slice]:
@@ -85,12 +188,13 @@ def crop(pair: StereoPair) -> StereoPair:
     if pair.left_seen is None and pair.right_seen is None:
         return pair
     rows, columns = find_content(pair)
-    camera = pair.camera
-    if camera is not None:
-        centre = camera.cx_px - columns.start, camera.cy_px - rows.start
-        camera = replace(camera, cx_px=centre[0], cy_px=centre[1])
+    camera = pair.camera and _crop_camera(pair.camera, rows, columns)
     left, right = (np.ascontiguousarray(image[rows, columns]) for image in (pair.left, pair.right))
     return StereoPair(left=left, right=right, camera=camera)
+
+
+def _crop_camera(camera: StereoCamera, rows: slice, columns: slice) -> StereoCamera:
+    return replace(camera, cx_px=camera.cx_px - columns.start, cy_px=camera.cy_px - rows.start)
 
 
 def _check_side_by_side(rig: Rig) -> None:
@@ -126,9 +230,7 @@ def _find_rotations(rig: Rig) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarra
     return turn, turn @ rig.rotation.T
 
 
-def _choose_camera(
-    rig: Rig, turns: Sequence[Float[np.ndarray, "3 3"]], size_px: tuple[int, int]
-) -> StereoCamera:
+def _choose_camera(rig: Rig, turns: Sequence[Float[np.ndarray, "3 3"]], size_px: Size) -> StereoCamera:
     """Choose the rectified camera so that both source pictures are, on average, centred in the result."""
     lenses = rig.left, rig.right
     focal_px = float(np.mean([optics.matrix[[0, 1], [0, 1]] for optics in lenses]))
@@ -153,23 +255,6 @@ def _find_direction(optics: Optics, at_px: Float[np.ndarray, "2"]) -> Float[np.n
     undistort = cv2.fisheye.undistortPoints if optics.fisheye else cv2.undistortPoints
     (x, y), *_ = undistort(at_px.reshape(1, 1, 2), optics.matrix, _pad_distortion(optics)).reshape(-1, 2)
     return np.array([x, y, 1])
-
-
-def _rectify_view(
-    image: UInt8[np.ndarray, "h w 3"], optics: Optics, turn: Float[np.ndarray, "3 3"], camera: StereoCamera
-) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
-    """Warp a picture to the rectified camera; return it with the mask of its valid pixels.
-
-    The border is repeated outside the picture, so that matching finds no false edge there.
-    """
-    height, width = image.shape[:2]
-    pinhole = np.array([[camera.focal_px, 0, camera.cx_px], [0, camera.focal_px, camera.cy_px], [0, 0, 1]])
-    places = cv2.fisheye.initUndistortRectifyMap if optics.fisheye else cv2.initUndistortRectifyMap
-    x_px, y_px = places(optics.matrix, _pad_distortion(optics), turn, pinhole, (width, height), cv2.CV_32FC1)
-    inside = (x_px > -0.5) & (x_px < width - 0.5) & (y_px > -0.5) & (y_px < height - 0.5)
-    inside &= _find_valid_field(optics, turn, pinhole, (height, width))
-    turned = cv2.remap(image, x_px, y_px, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    return turned, inside
 
 
 def _find_valid_field(
@@ -210,13 +295,11 @@ def _pad_distortion(optics: Optics) -> Float[np.ndarray, " n"]:
     return optics.distortion if optics.distortion.size else np.zeros(4)
 
 
-def _summarize(rig: Rig, turns: Sequence[Float[np.ndarray, "3 3"]], pair: StereoPair) -> Note:
+def _summarize(rig: Rig, turns: Sequence[Float[np.ndarray, "3 3"]], seen: Bool[np.ndarray, "h w"]) -> Note:
     left, right = (np.degrees(np.linalg.norm(cv2.Rodrigues(turn)[0])) for turn in turns)
-    assert pair.left_seen is not None and pair.right_seen is not None
-    seen_percent = 100 * (pair.left_seen & pair.right_seen).mean()
     return Note(
         f"rectified with {rig.name}: left picture rotated by {left:.2f} degrees, right picture by "
-        f"{right:.2f}; {seen_percent:.0f} % of the pixels are valid in both"
+        f"{right:.2f}; {100 * seen.mean():.0f} % of the pixels are valid in both"
     )
 
 

@@ -1,5 +1,6 @@
 """Intrinsics and relative pose of two cameras."""
 
+import hashlib
 from dataclasses import dataclass, replace
 
 import cv2
@@ -101,6 +102,12 @@ class Rig:
         """Distance between the two cameras in metres."""
         return float(np.linalg.norm(self.translation_m))
 
+    def digest(self) -> str:
+        """Return a fingerprint of the numbers, which differs between any two calibrations."""
+        optics = [(side.matrix, side.distortion, side.fisheye) for side in (self.left, self.right)]
+        numbers = [*optics[0], *optics[1], self.rotation, self.translation_m, self.size_px or ()]
+        return hashlib.sha256(repr([np.asarray(each).tolist() for each in numbers]).encode()).hexdigest()
+
     @property
     def rotation_degrees(self) -> float:
         """Angle between the orientations of the two cameras."""
@@ -144,9 +151,8 @@ class Rig:
             doffs_px=round(float(right[0, 2] - left[0, 2]), 9),
         )
 
-    def check_size(self, pair: StereoPair) -> None:
+    def check_size(self, size_px: Size) -> None:
         """Raise FormatError if the rig is for pictures of a different size."""
-        size_px = pair_size_px(pair)
         if self.size_px not in (None, size_px):
             raise FormatError(
                 f"{self.name}: expected a calibration for pictures of {format_size(size_px)}, found one for "

@@ -25,7 +25,7 @@ from stereoweave.cli.options import (
     make_sphere_request,
     replace_old_option,
 )
-from stereoweave.errors import StereoweaveError
+from stereoweave.errors import Remedy, StereoweaveError
 from stereoweave.video.times import PART_S
 
 if TYPE_CHECKING:
@@ -134,6 +134,13 @@ VideoModel = Annotated[
 ]
 
 
+VideoCalib = Annotated[
+    Path | None,
+    typer.Option(
+        help="Calibration file in OpenCV, Kalibr, KITTI or Middlebury format, for metres; all frames are "
+        "rectified by it and cropped to what both cameras see."
+    ),
+]
 RectifyShots = Annotated[
     bool,
     typer.Option(
@@ -159,6 +166,7 @@ def video(  # noqa: PLR0913 - each is an option of the command line
     format: Format = None,
     rate: Rate = None,
     rectify: RectifyShots = True,
+    calib: VideoCalib = None,
     projection: Projection = None,
     look: Look = None,
     fov: Fov = None,
@@ -171,6 +179,7 @@ def video(  # noqa: PLR0913 - each is an option of the command line
     arrangement: OldFormat = None,
 ) -> None:
     """Convert a stereo video to depth, a new view or a layout. Sound and frame times are kept."""
+    from stereoweave.cameras.calibration_files import read_rig
     from stereoweave.io.animation import require_video_extra
     from stereoweave.matching.backend import Backend
     from stereoweave.video.reader import open_video
@@ -200,6 +209,13 @@ def video(  # noqa: PLR0913 - each is an option of the command line
         rate=None if rate is None else _parse_rate(rate),
         sphere=make_sphere_request(projection, look, fov, lens_fov, whole),
     )
+    if calib:
+        if not rectify:
+            raise StereoweaveError(
+                f"{calib}: expected frames to rectify by it, found that they are not to be rectified",
+                remedy=Remedy("omit one of them", ("calibration", "rectify")),
+            )
+        source = source.rectify(read_rig(calib, source.size_px))
     _convert(source, videos, out, job, length_s)
 
 

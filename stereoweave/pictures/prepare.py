@@ -7,7 +7,7 @@ from pathlib import Path
 from stereoweave.cameras.alignment import RECTIFY, Alignment, check_pair
 from stereoweave.cameras.auto_align import align
 from stereoweave.cameras.calibration_files import read_rig
-from stereoweave.cameras.diagnosis import GIVE_DOFFS
+from stereoweave.cameras.diagnosis import CALIBRATE, CALIBRATE_AGAIN, GIVE_DOFFS
 from stereoweave.cameras.rectify import Rectified, rectify
 from stereoweave.cameras.rig import pair_size_px
 from stereoweave.cameras.sphere_windows import PerspectiveWindow
@@ -19,12 +19,10 @@ from stereoweave.pictures.panoramas import SphereView
 from stereoweave.stereo import StereoCamera, StereoPair
 from stereoweave.system.steps import step
 
-CALIBRATE = Remedy("give a calibration", ("calibration",))
 _NO_METRES_ON_CYLINDER = Note(
     "no depth in metres: a window of a 360-degree picture is no perspective image",
     Remedy("take the whole field of view for distances", ("whole",)),
 )
-_CALIBRATE_AGAIN = Remedy("give a calibration of these cameras", ("calibration",))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,7 +96,7 @@ def prepare(pictures: Sequence[Path], request: Request) -> Prepared:
             pair=ready.pair,
             pictures=tuple(pictures),
             notes=(*opened.notes, *ready.notes),
-            remedy=_CALIBRATE_AGAIN,
+            remedy=CALIBRATE_AGAIN,
             is_new=_is_new(pictures, opened.pair, ready.pair),
         )
     lens = opened.lens or Lens()
@@ -162,7 +160,7 @@ def _apply_calibration(pair: StereoPair, path: Path, rectified: bool) -> Rectifi
     rig = read_rig(path, pair_size_px(pair))
     if rectified:
         return rectify(pair, rig)
-    rig.check_size(pair)
+    rig.check_size(pair_size_px(pair))
     unlike = rig.unlike_rectified()
     if unlike:
         raise StereoweaveError(

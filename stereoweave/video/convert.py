@@ -71,7 +71,7 @@ def convert_video(
             because the disk is full.
     """
     _check_output(out, job, video, sources)
-    job = fit_to_sphere(job, video)
+    job = fit_to_video(job, video)
     matcher = load_matcher(job)
     compile_ahead(*_list_rehearsals(job))
     if job.is_fine:
@@ -160,12 +160,14 @@ def _list_rehearsals(job: VideoJob) -> tuple[Rehearsal, ...]:
     return (*depth, rehearse_fine_drawing) if job.is_fine else (*depth, rehearse_drawing, rehearse_filling)
 
 
-def fit_to_sphere(job: VideoJob, video: StereoVideo) -> VideoJob:
-    """Return the job as it is for a window of a VR180 or 360-degree video, or for the whole of it.
+def fit_to_video(job: VideoJob, video: StereoVideo) -> VideoJob:
+    """Return the job as it is for a calibrated video, or for what is shown of a VR180 or 360-degree video.
 
     Raises:
         StereoweaveError: The whole cannot be shown as the job says.
     """
+    if video.rig is not None:
+        return replace(job, rectify=False)
     if video.sphere is None:
         return job
     # The homographies that rectify shots fit perspective images only.
@@ -248,6 +250,7 @@ def _list_settings(job: VideoJob, video: StereoVideo, sources: Sequence[Path]) -
         "model": _identify_source(model) if model.exists() else str(job.backend.model),
         "film": [_identify_source(source) for source in sources],
         "stereoweave": __version__,
+        "calibration": video.rig and [video.rig.name, video.rig.digest()],
         **(video.sphere.settings if video.sphere else NO_SPHERE),
     }
 

@@ -56,8 +56,7 @@ def describe_values(
     if job.depth16:
         text = f"16-bit grey: disparity of the left view in pixels = value / {_STEPS_PER_PX}"
         if camera:
-            constant = camera.focal_px * camera.baseline_m * _STEPS_PER_PX
-            text += f"; depth in metres = {constant:.6g} / value"
+            text += f"; depth in metres = {_divide(camera, 'value', _STEPS_PER_PX)}"
         return {"comment": text + ending}
     if job.depth10:
         step_px = (high_px - low_px) / (_WHITE_10 - _BLACK_10)
@@ -66,7 +65,7 @@ def describe_values(
             f"(value - {_BLACK_10}), for values from {_BLACK_10} to {_WHITE_10}"
         )
         if camera:
-            text += f"; depth in metres = {camera.focal_px * camera.baseline_m:.6g} / disparity"
+            text += f"; depth in metres = {_divide(camera, 'disparity')}"
         return {"comment": text + ending}
     if job.depth and job.whole is not None:
         return {"comment": job.whole.describe_nearness(survey.range_px)}
@@ -76,6 +75,13 @@ def describe_values(
     if job.layout == "rgbd":
         return {"comment": f"disparity in grey: {low_px:.2f} px is black, {high_px:.2f} px is white"}
     return {}
+
+
+def _divide(camera: StereoCamera, name: str, steps_per_px: int = 1) -> str:
+    """Return the formula of depth in metres for a disparity of this name, in steps."""
+    sign, offset = "-" if camera.doffs_px < 0 else "+", abs(camera.doffs_px * steps_per_px)
+    shifted = f"({name} {sign} {offset:.6g})" if offset else name
+    return f"{camera.focal_px * camera.baseline_m * steps_per_px:.6g} / {shifted}"
 
 
 def _describe_disparity(disparity_px: float, camera: StereoCamera | None) -> str:

@@ -13,8 +13,10 @@ import numpy as np
 from jaxtyping import UInt8
 
 from stereoweave.arguments import check_choice
-from stereoweave.cameras.sphere_remap import Cutter
+from stereoweave.cameras.rectify import plan_rectification
+from stereoweave.cameras.rig import Rig
 from stereoweave.cameras.spherical import SphereRequest
+from stereoweave.cameras.unit_check import note_units
 from stereoweave.errors import FormatError, Note, Remedy, StereoweaveError
 from stereoweave.pictures.interleaved import InterleavedLayout
 from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS, PairLayout, detect_layout
@@ -41,6 +43,7 @@ _RETIMED = "its timestamp was missing or a duplicate, so it is shown slightly la
 
 
 FinePair = tuple[np.ndarray, np.ndarray]
+Remap = Callable[[np.ndarray], np.ndarray]
 _Source = Track | FrameSequence
 
 
@@ -88,6 +91,7 @@ class StereoVideo:
             or height.
         declared_sphere: Projection of a VR180, 360-degree or ordinary video, if the file declares one.
         sphere: Of a VR180 or 360-degree video, the window that its frames show; see `show`.
+        rig: Calibration by which the frames are rectified; see `rectify`.
         baseline_m: Distance of the eyes of such a video; None if it is unknown.
         own_colours: Primaries, transfer function and matrix of HDR and of wide colours, by FFmpeg's numbers;
             None for others.
@@ -121,7 +125,8 @@ class StereoVideo:
         self.declared_sphere = first.sphere
         self.sphere: SphereView | None = None
         self.baseline_m: float | None = None
-        self._cutter: Cutter | None = None
+        self.rig: Rig | None = None
+        self._remaps: tuple[Remap, Remap] | None = None
         self._first, self._last = 0, self.frame_count - 1
         self.own_colours = first.own_colours
         self._reads_fine = False
@@ -134,11 +139,36 @@ class StereoVideo:
     def show(self, view: SphereView, baseline_m: float | None, note: Note) -> "StereoVideo":
         """Return the same video with windows of its VR180 or 360-degree frames as frames."""
         shown = copy.copy(self)
-        shown.sphere, shown._cutter = view, view.cutter()
+        cut = view.cutter().cut
+        shown.sphere, shown._remaps = view, (cut, cut)
         shown.size_px, shown.pixel_aspect = view.window.size_px, Fraction(1)
         shown.baseline_m = baseline_m
         shown.camera = None if baseline_m is None else view.window.camera(baseline_m)
         shown.notes = (*self.notes, note)
+        return shown
+
+    def rectify(self, rig: Rig) -> "StereoVideo":
+        """Return the same video with frames that are rectified by a calibration, and its camera.
+
+        Rectified frames are cropped to what both cameras see.
+
+        Raises:
+            StereoweaveError: The frames are windows of a VR180 or 360-degree video; see also
+                `plan_rectification`.
+        """
+        if self.sphere is not None:
+            raise StereoweaveError(
+                f"{self.name}: expected no calibration, which follows from the projection",
+                setting="calibration",
+            )
+        plan = plan_rectification(rig, self.size_px).crop()
+        shown = copy.copy(self)
+        shown.rig, shown.camera = rig, plan.camera
+        if plan.views is not None:
+            left, right = plan.views
+            shown._remaps = left.apply, right.apply
+            shown.size_px, shown.pixel_aspect = left.size_px, Fraction(1)
+        shown.notes = (*self.notes, *plan.notes, *note_units(plan.camera, shown.size_px[0]))
         return shown
 
     def excerpt(self, start_s: float, length_s: float) -> "StereoVideo":
@@ -175,9 +205,7 @@ class StereoVideo:
         )
         for index, seen in zip(range(first + start, first + self.frame_count), every_track, strict=False):
             pictures = [picture for frame, _ in seen for picture in frame.pictures()]
-            left, right = self._split.eyes(*pictures) if self._split else pictures
-            if self._cutter:
-                left, right = self._cutter.cut(left), self._cutter.cut(right)
+            left, right = self._eyes(pictures)
             time = (steps[index] - steps[first]) * self.time_base
             self.on_frame(index - first)
             problem = self._describe_problem(index, [problem for _, problem in seen])
@@ -185,9 +213,14 @@ class StereoVideo:
             yield StereoFrame(left, right, time, problem, fine)
 
     def _split_fine(self, frames: Sequence[TrackFrame]) -> FinePair:
-        pictures = [picture for frame in frames for picture in frame.fine_pictures()]
+        return self._eyes([picture for frame in frames for picture in frame.fine_pictures()])
+
+    def _eyes(self, pictures: Sequence[np.ndarray]) -> FinePair:
+        """Return the pictures of both views of a frame."""
         left, right = self._split.eyes(*pictures) if self._split else pictures
-        return (self._cutter.cut(left), self._cutter.cut(right)) if self._cutter else (left, right)
+        if self._remaps is None:
+            return left, right
+        return self._remaps[0](left), self._remaps[1](right)
 
     def _describe_problem(self, index: int, problems: Sequence[str | None]) -> str | None:
         of_two = len(self._tracks) == 2

@@ -16,7 +16,7 @@ from rich.progress import Progress
 
 from stereoweave.cameras.alignment import RECTIFY, SWAPPED, check_pair
 from stereoweave.cameras.auto_align import Aligned, align
-from stereoweave.cameras.diagnosis import find_problems
+from stereoweave.cameras.diagnosis import CALIBRATE, CALIBRATE_AGAIN, find_problems
 from stereoweave.errors import Note, Remedy
 from stereoweave.io.colormap import find_colour_range_px
 from stereoweave.io.images import SMALLEST_SIDE_PX
@@ -35,8 +35,6 @@ _SURVEYED_FRAMES, _CHECKED_FRAMES = 24, 3
 _SURVEYED_WIDTH_PX = 320
 _SURVEY_STEP_PX = 4
 _NAMED_SPANS = 3
-# Videos cannot be rectified by a calibration.
-_REMEDY_OF_RECTIFIED = Remedy("rectify the frames by a calibration first")
 # The percentiles exclude outliers. The margin allows for objects that come nearer between surveyed frames.
 _OUTER_PERCENT, _MARGIN_PX = 0.5, 8.0
 
@@ -92,8 +90,9 @@ def survey_video(
     for sample in _sample_frames(video, matcher, (picked, checked), rectified=rectified, threads=threads):
         samples.append(sample)
         bar.advance(shown)
+    remedy = CALIBRATE_AGAIN if video.rig else CALIBRATE if rectified else RECTIFY
     defects = [
-        [_name_packing(note, video) for note in sample.notes]
+        [_fit_remedy(note, video, remedy) for note in sample.notes]
         for sample in samples
         if sample.notes is not None
     ]
@@ -155,8 +154,7 @@ def _sample_frame(frame: StereoFrame, matcher: Matcher, *, rectified: bool, chec
         list(aligned.notes) if checked else None,
     )
     if sample.notes is not None and not sample.flat:
-        remedy = _REMEDY_OF_RECTIFIED if rectified else RECTIFY
-        sample.notes.extend(find_problems(aligned.pair, estimate, aligned.alignment, remedy))
+        sample.notes.extend(find_problems(aligned.pair, estimate, aligned.alignment))
     return sample
 
 
@@ -204,8 +202,13 @@ def _spread_evenly(count: int, wanted: int) -> range:
     return range(step // 2, count, step)
 
 
-def _name_packing(note: Note, video: StereoVideo) -> Note:
-    """Return a note; if the views in a single file are swapped, its remedy names the other frame packing."""
+def _fit_remedy(note: Note, video: StereoVideo, remedy: Remedy) -> Note:
+    """Return a note on a frame with a remedy for the video.
+
+    It is `remedy` if rows are apart, and the other frame packing if the views in a single file are swapped.
+    """
+    if note.remedy == RECTIFY:
+        return replace(note, remedy=remedy)
     other = find_swapped_packing(video.frame_packing)
     if note == SWAPPED and other:
         return replace(note, remedy=Remedy(f"choose {other}", ("format",)))

@@ -312,7 +312,7 @@ def test_frames_that_could_not_be_rectified_ask_for_a_calibration(tmp_path, caps
     video = write_side_by_side(tmp_path / "in.mp4", [(left, larger)] * 2, codec="libx264")
     assert run(video, tmp_path / "out.mp4", "--depth", "--format", "side_by_side") == 0
     told = capsys.readouterr().err
-    assert "larger than the left one; rectify the frames by a calibration first" in told
+    assert "larger than the left one; give a calibration (--calib)" in told
 
 
 def _red_from_green(anaglyph: np.ndarray) -> float:
