@@ -218,6 +218,7 @@ class ChunkWorker:
         from stereoweave.io.animation import require_video_extra
 
         with require_video_extra("a video"):
+            from stereoweave.video.calibration import rectify_by
             from stereoweave.video.convert import convert_video
             from stereoweave.video.job import VideoJob
             from stereoweave.video.parts import parts_folder
@@ -231,6 +232,8 @@ class ChunkWorker:
             name_of=job.name_of,
         )
         video = open_video(films, job.request.format, sphere=job.request.sphere)
+        if job.request.calibration:
+            video = rectify_by(video, job.request.calibration, rectify=job.request.rectify)
         with self._open_results(entry, scratch) as out:
             make = partial(convert_video, video, films, out / FILM, film_job, Console(quiet=True))
             begun = parts_folder(out / FILM)
@@ -310,7 +313,6 @@ class ChunkWorker:
 def _note_unused_settings(job: DepthJob) -> list[Note]:
     """Return a list with a note on the settings that are for pairs only, if any are given."""
     for_pairs = {
-        "calibration": job.request.calibration is not None,
         "focal_px": job.request.focal_px is not None,
         "baseline_m": job.request.baseline_m is not None,
         "range_px": job.options.range_px is not None,

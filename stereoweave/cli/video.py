@@ -25,7 +25,7 @@ from stereoweave.cli.options import (
     make_sphere_request,
     replace_old_option,
 )
-from stereoweave.errors import Remedy, StereoweaveError
+from stereoweave.errors import StereoweaveError
 from stereoweave.video.times import PART_S
 
 if TYPE_CHECKING:
@@ -179,12 +179,12 @@ def video(  # noqa: PLR0913 - each is an option of the command line
     arrangement: OldFormat = None,
 ) -> None:
     """Convert a stereo video to depth, a new view or a layout. Sound and frame times are kept."""
-    from stereoweave.cameras.calibration_files import read_rig
     from stereoweave.io.animation import require_video_extra
     from stereoweave.matching.backend import Backend
     from stereoweave.video.reader import open_video
 
     with require_video_extra("a video"):
+        from stereoweave.video.calibration import rectify_by
         from stereoweave.video.job import VideoJob
 
     format = replace_old_option(("--arrangement", arrangement), ("--format", format))
@@ -210,12 +210,7 @@ def video(  # noqa: PLR0913 - each is an option of the command line
         sphere=make_sphere_request(projection, look, fov, lens_fov, whole),
     )
     if calib:
-        if not rectify:
-            raise StereoweaveError(
-                f"{calib}: expected frames to rectify by it, found that they are not to be rectified",
-                remedy=Remedy("omit one of them", ("calibration", "rectify")),
-            )
-        source = source.rectify(read_rig(calib, source.size_px))
+        source = rectify_by(source, calib, rectify=rectify)
     _convert(source, videos, out, job, length_s)
 
 

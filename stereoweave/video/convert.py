@@ -250,7 +250,7 @@ def _list_settings(job: VideoJob, video: StereoVideo, sources: Sequence[Path]) -
         "model": _identify_source(model) if model.exists() else str(job.backend.model),
         "film": [_identify_source(source) for source in sources],
         "stereoweave": __version__,
-        "calibration": video.rig and [video.rig.name, video.rig.digest()],
+        "calibration": video.rig and [video.rig.digest()],
         **(video.sphere.settings if video.sphere else NO_SPHERE),
     }
 

@@ -12,6 +12,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import av
 import fsspec
 import numpy as np
 import pyarrow.dataset
@@ -401,6 +402,16 @@ def checks_of_video(folder: Path, job: DepthJob) -> list[str]:
 def test_a_video_is_rectified_unless_refused_and_the_row_has_its_notes(tmp_path, rectify, told):
     job = replace(JOB, request=Request(format="side_by_side", rectify=rectify))
     assert told in " ".join(checks_of_video(tmp_path, job))
+
+
+def test_a_video_has_the_camera_of_the_calibration(tmp_path):
+    calibration = tmp_path / "calib.txt"
+    cameras = ["cam0=[300 0 80; 0 300 48; 0 0 1]", "cam1=[300 0 80; 0 300 48; 0 0 1]"]
+    calibration.write_text("\n".join([*cameras, "doffs=0", "baseline=100", "width=160", "height=96"]))
+    job = replace(JOB, request=Request(format="crossed", calibration=calibration))
+    assert "is a calibration of rectified pictures" in " ".join(checks_of_video(tmp_path, job))
+    with av.open(str(tmp_path / "out" / "sea.mkv" / FILM)) as film:
+        assert film.metadata["COMMENT"].endswith("depth in metres = 7680 / value")  # 300 * 0.1 * 256
 
 
 def test_the_row_of_a_video_names_the_settings_that_apply_to_pairs_only(tmp_path):
