@@ -181,7 +181,7 @@ class Estimate:
         confidence: Estimated probability, float32 in 0..1, that disparity_px is within 1 px of the truth.
         occluded: Mask, bool, of the pixels that only the left camera sees.
         pair: The pair that the estimate belongs to, if `estimate` aligned it, opened it from one file or
-            turned or converted one of two files; None if the estimate belongs to the images as given.
+            turned one of two files as the other; None if the estimate belongs to the images as given.
         notes: Notes on how `estimate` opened or aligned the pair, or why it could not align it, and on other
             problems, such as a range that is too narrow; `str` gives their text.
     """

@@ -102,7 +102,7 @@ def show(  # noqa: PLR0913 - source, output and settings
         if capture.count == 1 and format is None:
             format = detect_layout(capture.name, moment.pictures, capture.declared_packing)
         split = _split_pair(moment.pictures, format)
-        if rig and not plan:
+        if rig and (plan is None or plan.size_px != pair_size_px(split)):
             plan = plan_rectification(rig, pair_size_px(split))
         ready = plan.apply(split) if plan else Rectified(pair=replace(split, camera=capture.camera))
         pair = ready.pair

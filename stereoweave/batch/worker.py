@@ -218,7 +218,7 @@ class ChunkWorker:
         from stereoweave.io.animation import require_video_extra
 
         with require_video_extra("a video"):
-            from stereoweave.video.calibration import rectify_by
+            from stereoweave.video.calibration import fits, rectify_by
             from stereoweave.video.convert import convert_video
             from stereoweave.video.job import VideoJob
             from stereoweave.video.parts import parts_folder
@@ -232,7 +232,7 @@ class ChunkWorker:
             name_of=job.name_of,
         )
         video = open_video(films, job.request.format, sphere=job.request.sphere)
-        if job.request.calibration:
+        if job.request.calibration and fits(video, job.request.calibration):
             video = rectify_by(video, job.request.calibration, rectify=job.request.rectify)
         with self._open_results(entry, scratch) as out:
             make = partial(convert_video, video, films, out / FILM, film_job, Console(quiet=True))
@@ -250,7 +250,10 @@ class ChunkWorker:
                 tally = make()
         width, height = video.size_px
         checks = [
-            *(note.format(job.name_of) for note in _note_unused_settings(job)),
+            *(
+                note.format(job.name_of)
+                for note in _note_unused_settings(job, calibrated=video.rig is not None)
+            ),
             *tally.notes,
             *tally.named,
         ]
@@ -310,9 +313,10 @@ class ChunkWorker:
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
-def _note_unused_settings(job: DepthJob) -> list[Note]:
+def _note_unused_settings(job: DepthJob, *, calibrated: bool) -> list[Note]:
     """Return a list with a note on the settings that are for pairs only, if any are given."""
     for_pairs = {
+        "calibration": job.request.calibration is not None and not calibrated,
         "focal_px": job.request.focal_px is not None,
         "baseline_m": job.request.baseline_m is not None,
         "range_px": job.options.range_px is not None,

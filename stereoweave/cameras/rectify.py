@@ -77,8 +77,9 @@ class RectifiedView:
     def crop(self, rows: slice, columns: slice) -> "RectifiedView":
         """Return the remap to a rectangle of the results."""
         part = copy.copy(self)
-        part._x_px, part._y_px = self._x_px[rows, columns], self._y_px[rows, columns]
-        part.seen = self.seen[rows, columns]
+        part._x_px, part._y_px, part.seen = (
+            np.ascontiguousarray(each[rows, columns]) for each in (self._x_px, self._y_px, self.seen)
+        )
         return part
 
 
@@ -87,11 +88,13 @@ class Rectification:
     """Rectification of all pictures that a rig takes.
 
     Attributes:
+        size_px: Width and height of the pictures.
         camera: Camera of the rectified pictures.
         views: Remaps of the left and the right pictures; None if the pictures are rectified as they are.
         notes: Notes on the rig and the rectification.
     """
 
+    size_px: Size
     camera: StereoCamera
     views: tuple[RectifiedView, RectifiedView] | None
     notes: tuple[Note, ...]
@@ -151,7 +154,7 @@ def plan_rectification(rig: Rig, size_px: Size) -> Rectification:
     _check_side_by_side(rig)
     if rig.unlike_rectified() is None:
         note = Note(f"{rig.name} is a calibration of rectified pictures, so they are left unchanged")
-        return Rectification(camera=rig.camera(), views=None, notes=(*rig.notes, note))
+        return Rectification(size_px=size_px, camera=rig.camera(), views=None, notes=(*rig.notes, note))
     # Values that cannot be computed become NaN or infinity and are rejected later.
     with np.errstate(all="ignore"):
         turns = _find_rotations(rig)
@@ -164,7 +167,7 @@ def plan_rectification(rig: Rig, size_px: Size) -> Rectification:
             f"{'the right' if left.seen.any() else 'the left'} one does not see it; check the rotation"
         )
     note = _summarize(rig, turns, left.seen & right.seen)
-    return Rectification(camera=camera, views=(left, right), notes=(*rig.notes, note))
+    return Rectification(size_px=size_px, camera=camera, views=(left, right), notes=(*rig.notes, note))
 
 
 def find_content(pair: StereoPair) -> tuple[slice, slice]:

@@ -119,9 +119,9 @@ def _match_two_files(
     opened = open_two(left, right, panorama=request.sphere.projection is not None)
     found = _match_images(opened.pair, backend, options, request)
     notes = (*_fit_to_python(opened.notes), *found.notes)
-    # A file may be turned by the other's EXIF tag; callers that read it alone would get another pair.
-    changed = opened.pair if opened.notes else None
-    return replace(found, pair=found.pair or changed, notes=notes)
+    # Callers that read each file alone would get another pair.
+    turned = opened.pair if opened.turned_alike else None
+    return replace(found, pair=found.pair or turned, notes=notes)
 
 
 def _match_images(given: StereoPair, backend: Backend, options: MatchOptions, request: Request) -> Estimate:

@@ -61,6 +61,8 @@ class Opened:
         layout: Layout of the files, which is a name in `PAIR_LAYOUTS`, "mpo" or "two_pictures" (also for a
             HEIC or LIF file with two views and an animation of two frames).
         notes: Notes on what was detected or changed.
+        turned_alike: Whether both of two pictures are turned by the EXIF orientation of one, although the
+            other has none or another.
         lens: Camera parameters from the metadata, in pixels of the pair; None if there are none.
         projection: Projection of both images; None for ordinary ones.
         sphere: Of a VR180 or 360-degree picture, the window of it that the pair shows.
@@ -69,6 +71,7 @@ class Opened:
     pair: StereoPair
     layout: str
     notes: tuple[Note, ...] = ()
+    turned_alike: bool = False
     lens: exif.Lens | None = None
     projection: Projection | None = None
     sphere: panoramas.SphereView | None = None
@@ -194,10 +197,12 @@ def open_two(left: Path, right: Path, *, panorama: bool) -> Opened:
     decoded = [read_picture(path, panorama=panorama) for path in (left, right)]
     lies, notes = _choose_orientations(*decoded)
     eyes = [each.upright(lie) for each, lie in zip(decoded, lies, strict=True)]
+    own = tuple(exif.read_orientation(each.tags) for each in decoded)
     return Opened(
         pair=make_pair(left, eyes[0], right, eyes[1]),
         layout=TWO_PICTURES,
         notes=(*notes, *_note_colours(decoded)),
+        turned_alike=lies != own,
         lens=_read_lens(decoded),
     )
 

@@ -4,7 +4,7 @@ import csv
 import glob
 import os
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain, repeat, takewhile
 from pathlib import Path
@@ -184,9 +184,8 @@ def find_pairs_among(folder: str | Path, paths: Iterable[str]) -> Listed:
     pictures = [*files["picture"], *_find_undeveloped(files["raw"], files["picture"])]
     halves, doubles = pair_by_marks(pictures), files["both views"]
     views = _find_views(halves, pictures)
-    rectified = _find_rectified(halves, files[_RECTIFIED_FILE])
-    halves = [pair for pair in halves if views.isdisjoint(pair) and pair not in rectified]
-    rest = sorted(set(pictures).difference(views, chain.from_iterable((*halves, *rectified))))
+    halves = [pair for pair in halves if views.isdisjoint(pair)]
+    rest = sorted(set(pictures).difference(views, chain.from_iterable(halves)))
     if not (halves or doubles):
         doubles, rest = rest, []
     whole, calibrations = _absolute(folder).name, set(files[_CALIBRATION])
@@ -327,6 +326,7 @@ def _group_by_kind(paths: Iterable[str]) -> dict[str, list[str]]:
         for path in kinds[first]
         for name in names
     }
+    made.update(_find_rectified(kinds))
     kinds["picture"] = [path for path in kinds["picture"] if path not in made]
     return kinds
 
@@ -346,11 +346,11 @@ def _find_views(halves: Sequence[tuple[str, str]], pictures: Sequence[str]) -> s
     return {path for path in unpaired if (view := _VIEW.fullmatch(splitext(path)[0])) and view[1] in lefts}
 
 
-def _find_rectified(halves: Sequence[tuple[str, str]], marks: Sequence[str]) -> set[tuple[str, str]]:
-    """Return the pairs that `rectify` wrote to a folder named after the left picture of another pair."""
-    named = {splitext(left)[0] + _RECTIFIED for left, _ in halves}
-    own = named.intersection(mark.rpartition("/")[0] for mark in marks)
-    return {pair for pair in halves if pair[0].rpartition("/")[0] in own}
+def _find_rectified(kinds: Mapping[str, Sequence[str]]) -> set[str]:
+    """Return the pictures that `rectify` wrote to a folder named after a picture beside the folder."""
+    named = {splitext(path)[0] + _RECTIFIED for kind in _ENDINGS for path in kinds[kind]}
+    own = named.intersection(mark.rpartition("/")[0] for mark in kinds[_RECTIFIED_FILE])
+    return {f"{folder}/{side}.png" for folder in own for side in ("left", "right")}
 
 
 def _list_parents(path: str) -> list[str]:

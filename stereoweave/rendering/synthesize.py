@@ -23,7 +23,7 @@ def synthesize(  # noqa: PLR0913 - all but the first three are optional
     """Estimate the refined disparity of a rectified pair and render the view from a position.
 
     Args:
-        left: Left image, as for `estimate`: path, PIL image, array or tensor.
+        left: Left image, as `as_rgb` takes it: path, PIL image, array or tensor.
         right: Right image of the same size.
         position: Position from -1 to 2; 0 is the left camera and 1 the right one.
         model: See `estimate`. The default is the most accurate one, because a new view shows every error at

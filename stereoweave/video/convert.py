@@ -20,6 +20,7 @@ from stereoweave.io.output_lock import lock_output
 from stereoweave.matching.edge_vote.vote import rehearse_voting
 from stereoweave.pictures.panoramas import NO_SPHERE
 from stereoweave.rendering.rehearsals import rehearse_drawing, rehearse_filling, rehearse_fine_drawing
+from stereoweave.stereo import StereoCamera
 from stereoweave.system.compiling_ahead import Rehearsal, compile_ahead
 from stereoweave.system.progress import progress
 from stereoweave.system.threads import thread_count
@@ -192,10 +193,15 @@ def _mark_output(job: VideoJob, video: StereoVideo, *, warped: bool) -> VideoMar
     )
     if job.whole is not None:
         return job.whole.marks(baseline_m)
-    # Of a window aside, the marks cannot say that its middle is elsewhere.
-    aside = video.camera is not None and abs(2 * video.camera.cx_px + 1 - video.size_px[0]) > 1
-    camera = None if warped or aside else video.camera
+    camera = (
+        None if warped or (video.camera and not _is_centred(video.camera, video.size_px[0])) else video.camera
+    )
     return mark_layout(job.layout, camera, video.size_px[0], baseline_m)
+
+
+def _is_centred(camera: StereoCamera, width_px: int) -> bool:
+    """Return whether marks can describe a camera: they tell neither another middle nor doffs."""
+    return abs(2 * camera.cx_px + 1 - width_px) <= 1 and not camera.doffs_px
 
 
 class _Meter:

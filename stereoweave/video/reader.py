@@ -14,10 +14,10 @@ from jaxtyping import UInt8
 
 from stereoweave.arguments import check_choice
 from stereoweave.cameras.rectify import plan_rectification
-from stereoweave.cameras.rig import Rig
+from stereoweave.cameras.rig import Rig, format_size
 from stereoweave.cameras.spherical import SphereRequest
-from stereoweave.cameras.unit_check import note_units
 from stereoweave.errors import FormatError, Note, Remedy, StereoweaveError
+from stereoweave.io.images import SMALLEST_SIDE_PX
 from stereoweave.pictures.interleaved import InterleavedLayout
 from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS, PairLayout, detect_layout
 from stereoweave.pictures.panoramas import SphereView, choose_layout, guess_projection
@@ -83,7 +83,7 @@ class StereoVideo:
             different numbers of frames, this is the lower number.
         rate: Average frames per second.
         time_base: Time unit in seconds; every frame time is a multiple of this unit.
-        camera: Camera of the views as the file declares it; None if it is unknown.
+        camera: Camera of the views, as the file declares it or by a calibration; None if it is unknown.
         sound: File that contains the sound; None for a silent video.
         excerpted: Name of the part of a longer video that this is, such as "1440+120" for 120 frames from
             frame 1440 on; None for a whole video.
@@ -91,8 +91,8 @@ class StereoVideo:
             or height.
         declared_sphere: Projection of a VR180, 360-degree or ordinary video, if the file declares one.
         sphere: Of a VR180 or 360-degree video, the window that its frames show; see `show`.
-        rig: Calibration by which the frames are rectified; see `rectify`.
         baseline_m: Distance of the eyes of such a video; None if it is unknown.
+        rig: Calibration by which the frames are rectified; see `rectify`.
         own_colours: Primaries, transfer function and matrix of HDR and of wide colours, by FFmpeg's numbers;
             None for others.
         on_frame: Function that `frames` calls with the number of each frame that it yields, to show progress.
@@ -158,17 +158,28 @@ class StereoVideo:
         """
         if self.sphere is not None:
             raise StereoweaveError(
-                f"{self.name}: expected no calibration, which follows from the projection",
-                setting="calibration",
+                f"{self.name}: expected no calibration for a VR180 or 360-degree video, found {rig.name}",
+                remedy=Remedy(
+                    "omit it, or choose rectilinear if the video is an ordinary one",
+                    ("calibration", "projection"),
+                ),
             )
         plan = plan_rectification(rig, self.size_px).crop()
         shown = copy.copy(self)
+        replaced = (
+            [] if self.camera is None else [Note(f"{rig.name} replaces the camera that the video declares")]
+        )
         shown.rig, shown.camera = rig, plan.camera
         if plan.views is not None:
             left, right = plan.views
             shown._remaps = left.apply, right.apply
             shown.size_px, shown.pixel_aspect = left.size_px, Fraction(1)
-        shown.notes = (*self.notes, *plan.notes, *note_units(plan.camera, shown.size_px[0]))
+        if min(shown.size_px) < SMALLEST_SIDE_PX:
+            raise StereoweaveError(
+                f"{rig.name}: expected at least {SMALLEST_SIDE_PX}x{SMALLEST_SIDE_PX} pixels that both "
+                f"cameras see, found {format_size(shown.size_px)}; check the rotation"
+            )
+        shown.notes = (*self.notes, *replaced, *plan.notes)
         return shown
 
     def excerpt(self, start_s: float, length_s: float) -> "StereoVideo":

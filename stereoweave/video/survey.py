@@ -24,7 +24,7 @@ from stereoweave.matching.estimate import match
 from stereoweave.matching.matcher import Matcher
 from stereoweave.rendering.layouts import median_disparity_px
 from stereoweave.rendering.scaling import fit_size
-from stereoweave.stereo import StereoPair
+from stereoweave.stereo import StereoCamera, StereoPair
 from stereoweave.system.threads import thread_count
 from stereoweave.video.packings import find_swapped_packing
 from stereoweave.video.reader import StereoFrame, StereoVideo
@@ -90,7 +90,7 @@ def survey_video(
     for sample in _sample_frames(video, matcher, (picked, checked), rectified=rectified, threads=threads):
         samples.append(sample)
         bar.advance(shown)
-    remedy = CALIBRATE_AGAIN if video.rig else CALIBRATE if rectified else RECTIFY
+    remedy = _choose_remedy(video, rectified=rectified)
     defects = [
         [_fit_remedy(note, video, remedy) for note in sample.notes]
         for sample in samples
@@ -125,7 +125,12 @@ def _sample_frames(
                 # Frames wait in memory until they are measured, so only some are read ahead.
                 if len(coming) > count:
                     yield coming.popleft().result()
-                work = partial(_sample_frame, rectified=rectified, checked=index in checked)
+                work = partial(
+                    _sample_frame,
+                    rectified=rectified,
+                    checked=index in checked,
+                    camera=video.camera if video.rig else None,
+                )
                 coming.append(pool.submit(work, frame, matcher))
             while coming:
                 yield coming.popleft().result()
@@ -134,8 +139,15 @@ def _sample_frames(
                 future.cancel()
 
 
-def _sample_frame(frame: StereoFrame, matcher: Matcher, *, rectified: bool, checked: bool) -> _Sample:
-    """Measure a frame; unless it is `checked` for problems, at a smaller size."""
+def _sample_frame(
+    frame: StereoFrame,
+    matcher: Matcher,
+    *,
+    rectified: bool,
+    checked: bool,
+    camera: StereoCamera | None = None,
+) -> _Sample:
+    """Measure a frame; unless it is `checked` for problems, as its camera is too, at a smaller size."""
     pair, scale = StereoPair(left=frame.left, right=frame.right), 1.0
     if not checked:
         pair, scale = scale_down(pair)
@@ -154,7 +166,8 @@ def _sample_frame(frame: StereoFrame, matcher: Matcher, *, rectified: bool, chec
         list(aligned.notes) if checked else None,
     )
     if sample.notes is not None and not sample.flat:
-        sample.notes.extend(find_problems(aligned.pair, estimate, aligned.alignment))
+        seen_by = replace(aligned.pair, camera=camera)
+        sample.notes.extend(find_problems(seen_by, estimate, aligned.alignment))
     return sample
 
 
@@ -202,7 +215,16 @@ def _spread_evenly(count: int, wanted: int) -> range:
     return range(step // 2, count, step)
 
 
-def _fit_remedy(note: Note, video: StereoVideo, remedy: Remedy) -> Note:
+def _choose_remedy(video: StereoVideo, *, rectified: bool) -> Remedy | None:
+    """Return what to do if rows are apart."""
+    if video.rig:
+        return CALIBRATE_AGAIN
+    if not rectified:
+        return RECTIFY
+    return None if video.sphere else CALIBRATE
+
+
+def _fit_remedy(note: Note, video: StereoVideo, remedy: Remedy | None) -> Note:
     """Return a note on a frame with a remedy for the video.
 
     It is `remedy` if rows are apart, and the other frame packing if the views in a single file are swapped.

@@ -414,6 +414,15 @@ def test_a_video_has_the_camera_of_the_calibration(tmp_path):
         assert film.metadata["COMMENT"].endswith("depth in metres = 7680 / value")  # 300 * 0.1 * 256
 
 
+def test_a_calibration_for_other_pictures_is_named_and_not_used_for_a_video(tmp_path):
+    calibration = tmp_path / "calib.txt"
+    cameras = ["cam0=[300 0 80; 0 300 48; 0 0 1]", "cam1=[300 0 80; 0 300 48; 0 0 1]"]
+    calibration.write_text("\n".join([*cameras, "doffs=0", "baseline=100", "width=640", "height=480"]))
+    job = replace(JOB, request=Request(format="crossed", calibration=calibration))
+    told = "some settings were not used for this video; they apply to pairs only (calibration)"
+    assert told in checks_of_video(tmp_path, job)
+
+
 def test_the_row_of_a_video_names_the_settings_that_apply_to_pairs_only(tmp_path):
     request = Request(format="crossed", focal_px=700.0, baseline_m=0.1)
     job = DepthJob(request=request, options=MatchOptions(raw=True, range_px=(0, 64)), files=("depth.png",))

@@ -174,10 +174,21 @@ def test_views_of_a_pair_beside_it_are_no_pictures(layout, left):
     assert found.left_out == []
 
 
-def test_rectified_pictures_of_a_pair_beside_it_are_no_other_pair():
-    pair, made = ("a/1_L.png", "a/1_R.png"), ["left.png", "right.png", "rectified.json", "calib.yml"]
-    found = find_pairs_among("x", [*pair, *(f"a/1_L_rectified/{name}" for name in made)])
-    assert [each.files for each in found.pairs] == [pair]
+@pytest.mark.parametrize(
+    "pictures",
+    [
+        ("a/1_L.png", "a/1_R.png"),
+        ("cam0/a.png", "cam1/a.png"),
+        ("L001.png", "R001.png"),
+        ("p.mpo",),
+        ("p.png",),
+    ],
+)
+def test_rectified_pictures_beside_their_originals_are_no_other_pair(pictures):
+    folder = pictures[0].rpartition(".")[0] + "_rectified"
+    made = [f"{folder}/{name}" for name in ("left.png", "right.png", "rectified.json", "calib.yml")]
+    found = find_pairs_among("x", [*pictures, *made])
+    assert [each.files for each in found.pairs] == [pictures]
     assert found.left_out == []
 
 

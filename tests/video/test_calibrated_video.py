@@ -1,16 +1,20 @@
 """Conversion of videos whose frames are rectified by a calibration."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import av
 import numpy as np
 import pytest
 from conversions import frames_of, interrupt, run, write_slow_video
-from rig_examples import Cameras, Sphere, pinhole, rig_of, speckle
-from video_examples import example_pairs, write_side_by_side
+from rig_examples import Cameras, Sphere, fisheye, pinhole, rig_of, speckle
+from spatial_examples import SPATIAL
+from video_examples import example_pairs, write_side_by_side, write_video
 
 from stereoweave.cameras.calibration_files import write_rig
 from stereoweave.cameras.rectify import crop, rectify
+from stereoweave.cameras.rig import make_rectified_rig
+from stereoweave.errors import StereoweaveError
 from stereoweave.stereo import StereoPair
 from stereoweave.video.reader import open_video
 
@@ -38,7 +42,7 @@ def calibration(tmp_path_factory) -> Path:
 
 def write_parallel_calibration(path: Path, doffs_px: float, baseline_mm: float = 100) -> Path:
     """Write the calibration of rectified pictures of 160x96 px, with a focal length of 300 px."""
-    cameras = [f"cam{i}=[300 0 {80 + i * doffs_px}; 0 300 48; 0 0 1]" for i in (0, 1)]
+    cameras = [f"cam{i}=[300 0 {79.5 + i * doffs_px}; 0 300 47.5; 0 0 1]" for i in (0, 1)]
     numbers = [f"doffs={doffs_px}", f"baseline={baseline_mm}", "width=160", "height=96"]
     path.write_text("\n".join([*cameras, *numbers]))
     return path
@@ -97,11 +101,13 @@ def test_a_calibration_of_rectified_pictures_adds_metres_alone(tmp_path, doffs_p
         ([], "rig.yml: expected a calibration for pictures of 160x96, found one for 640x480"),
         (
             ["--no-rectify"],
-            "rig.yml: expected frames to rectify by it, found that they are not to be rectified",
+            "rig.yml: expected a calibration of rectified frames, found lenses with distortion; "
+            "rectify the frames with it (--rectify)",
         ),
         (
             ["--projection", "fisheye"],
-            "in.mp4: expected no calibration, which follows from the projection",
+            "in.mp4: expected no calibration for a VR180 or 360-degree video, found {calibration}; "
+            "omit it, or choose rectilinear if the video is an ordinary one (--calib, --projection)",
         ),
     ],
 )
@@ -110,8 +116,69 @@ def test_a_calibration_that_does_not_fit_is_refused_in_one_line(tmp_path, capsys
     words = ["--depth", "--calib", str(calibration), *words]
     assert run(video, tmp_path / "out.mp4", *words) == 2
     [line] = capsys.readouterr().err.splitlines()
-    assert told in line
+    assert told.format(calibration=calibration) in line
     assert [path.name for path in tmp_path.iterdir()] == ["in.mp4"]
+
+
+def test_cameras_that_hardly_see_the_same_are_refused(wall):
+    rig = rig_of(pinhole, degrees=(48, 0, 0))
+    with pytest.raises(StereoweaveError, match=r"^the calibration: expected at least 32x32 pixels that both"):
+        open_video([wall], "side_by_side").rectify(rig)
+
+
+def test_an_excerpt_of_two_files_by_fisheye_lenses_has_the_frames_of_the_rectified_video(tmp_path):
+    rig = replace(rig_of(fisheye), size_px=None)
+    pairs = [tuple(np.tile(view, (5, 4, 1)) for view in pair) for pair in example_pairs(4)]
+    files = [tmp_path / f"{side}.mkv" for side in ("left", "right")]
+    for file, views in zip(files, zip(*pairs, strict=True), strict=True):
+        write_video(file, views, codec="libx264")
+    video = open_video(files).rectify(rig)
+    part = video.excerpt(0.08, 0.08)  # of 25 frames a second
+    expected = list(video.frames())[2:]
+    assert part.size_px == video.size_px == (expected[0].left.shape[1], expected[0].left.shape[0])
+    for found, frame in zip(part.frames(), expected, strict=True):
+        np.testing.assert_array_equal(found.left, frame.left)
+        np.testing.assert_array_equal(found.right, frame.right)
+
+
+def test_pictures_with_all_their_bits_are_rectified_like_those_of_8_bits(wall):
+    video = open_video([wall], "side_by_side").rectify(RIG)
+    video.read_fine()
+    frame = next(video.frames())
+    for fine, view in zip(frame.fine(), (frame.left, frame.right), strict=True):
+        off = np.abs(np.clip(fine, 0, 255) - view)
+        assert fine.dtype == np.float32
+        assert off.mean() < 1
+
+
+def test_the_camera_of_a_spatial_video_is_replaced_with_a_note():
+    video = open_video([SPATIAL])
+    rig = make_rectified_rig(*[np.array([[300.0, 0, 159.5], [0, 300, 119.5], [0, 0, 1]])] * 2, -0.1)
+    calibrated = video.rectify(rig)
+    assert video.camera.baseline_m != 0.1
+    assert calibrated.camera.baseline_m == 0.1
+    assert "the calibration replaces the camera that the video declares" in map(str, calibrated.notes)
+
+
+def test_disparities_beyond_infinity_are_noted(tmp_path, capsys):
+    """The right views are moved by 40 px, as by converged cameras whose doffs the calibration lacks."""
+    pairs = [(left, np.roll(right, 40, axis=1)) for left, right in example_pairs(2)]
+    video = write_side_by_side(tmp_path / "in.mp4", pairs, codec="libx264")
+    words = ["--calib", str(write_parallel_calibration(tmp_path / "calib.txt", 0))]
+    assert run(video, tmp_path / "out.mp4", "--depth", "--format", "side_by_side", *words) == 0
+    told = capsys.readouterr().err
+    assert "depths in metres are wrong: " in told
+    assert told.count("give a calibration with doffs (--calib)") == 1
+
+
+@pytest.mark.parametrize("doffs_px", [0, 12])
+def test_the_output_is_marked_with_a_camera_without_doffs_alone(tmp_path, doffs_px):
+    video = write_side_by_side(tmp_path / "in.mp4", example_pairs(2), codec="libx264")
+    calibration = write_parallel_calibration(tmp_path / "calib.txt", doffs_px)
+    words = ["--layout", "side_by_side", "--calib", str(calibration)]
+    assert run(video, tmp_path / "out.mp4", *words) == 0
+    [out] = tmp_path.glob("out*.mp4")
+    assert (open_video([out]).camera is None) == bool(doffs_px)
 
 
 def test_a_conversion_with_another_calibration_is_not_resumed(tmp_path, monkeypatch, capsys):
