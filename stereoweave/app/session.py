@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from stereoweave.app.stereo_pictures import StereoPicture, Wish, crop_both
-from stereoweave.cameras.rectify import find_content
+from stereoweave.cameras.content import find_content
 from stereoweave.errors import FormatError, NameOf, Note, Remedy, StereoweaveError, keyword
 from stereoweave.io.colormap import colour_disparity, find_colour_range_px
 from stereoweave.matching.backend import Backend

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from stereoweave.cameras.rectify import crop, find_content
+from stereoweave.cameras.content import crop, find_content
 from stereoweave.io.images import write_image
 from stereoweave.outputs.run import Result
 from stereoweave.outputs.view_files import ViewFile, can_crop

@@ -148,7 +148,7 @@ def rectify(  # noqa: PLR0913 - each is an option of the command line
     calib.yml is the calibration of the results, rectified.json names the sources.
     """
     from stereoweave.cameras.calibration_files import write_rig
-    from stereoweave.cameras.rectify import crop
+    from stereoweave.cameras.content import crop
     from stereoweave.cameras.rig import format_size, pair_size_px, rectified_rig
     from stereoweave.io.files import refuse_inputs
     from stereoweave.io.images import write_image

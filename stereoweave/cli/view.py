@@ -175,8 +175,8 @@ def _render(
     file: "ViewFile", prepared: "Prepared", backend: "Backend", options: "MatchOptions", whole: bool
 ) -> None:
     """Match a pair, write its views, and print what was written."""
+    from stereoweave.cameras.content import crop as crop_to_content
     from stereoweave.cameras.diagnosis import find_problems
-    from stereoweave.cameras.rectify import crop as crop_to_content
     from stereoweave.io.files import refuse_inputs
     from stereoweave.matching.estimate import match
     from stereoweave.outputs.sphere_views import write_whole_view

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 import numpy as np
 from jaxtyping import Bool
 
-from stereoweave.cameras.rectify import find_content
+from stereoweave.cameras.content import find_content
 from stereoweave.errors import Remedy, StereoweaveError
 from stereoweave.rendering.renderer import Renderer
 

@@ -10,7 +10,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from stereoweave.cameras.alignment import SWAPPED
-from stereoweave.cameras.rectify import crop
+from stereoweave.cameras.content import crop
 from stereoweave.errors import Note, StereoweaveError
 from stereoweave.io.decoding import MOST_PIXELS, open_picture
 from stereoweave.io.images import write_image

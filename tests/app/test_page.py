@@ -17,7 +17,7 @@ from PIL import Image
 from playwright.sync_api import Browser
 
 from stereoweave.app.session import Uploads, match_uploads, open_session, zip_files
-from stereoweave.cameras.rectify import find_content
+from stereoweave.cameras.content import find_content
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.colormap import colour_disparity, find_colour_range_px
 from stereoweave.io.images import read_image, write_image

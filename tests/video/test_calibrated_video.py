@@ -12,7 +12,8 @@ from spatial_examples import SPATIAL
 from video_examples import example_pairs, write_side_by_side, write_video
 
 from stereoweave.cameras.calibration_files import write_rig
-from stereoweave.cameras.rectify import crop, rectify
+from stereoweave.cameras.content import crop
+from stereoweave.cameras.rectify import rectify
 from stereoweave.cameras.rig import make_rectified_rig
 from stereoweave.errors import StereoweaveError
 from stereoweave.stereo import StereoPair
