@@ -218,7 +218,7 @@ class ChunkWorker:
         from stereoweave.io.animation import require_video_extra
 
         with require_video_extra("a video"):
-            from stereoweave.video.calibration import fits, rectify_by
+            from stereoweave.video.calibration import rectify_if_it_fits
             from stereoweave.video.convert import convert_video
             from stereoweave.video.job import VideoJob
             from stereoweave.video.parts import parts_folder
@@ -232,8 +232,7 @@ class ChunkWorker:
             name_of=job.name_of,
         )
         video = open_video(films, job.request.format, sphere=job.request.sphere)
-        if job.request.calibration and fits(video, job.request.calibration):
-            video = rectify_by(video, job.request.calibration, rectify=job.request.rectify)
+        video = rectify_if_it_fits(video, job.request.calibration, rectify=job.request.rectify)
         with self._open_results(entry, scratch) as out:
             make = partial(convert_video, video, films, out / FILM, film_job, Console(quiet=True))
             begun = parts_folder(out / FILM)

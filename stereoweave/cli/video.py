@@ -209,9 +209,7 @@ def video(  # noqa: PLR0913 - each is an option of the command line
         rate=None if rate is None else _parse_rate(rate),
         sphere=make_sphere_request(projection, look, fov, lens_fov, whole),
     )
-    if calib:
-        source = rectify_by(source, calib, rectify=rectify)
-    _convert(source, videos, out, job, length_s)
+    _convert(rectify_by(source, calib, rectify=rectify), videos, out, job, length_s)
 
 
 def _convert(
