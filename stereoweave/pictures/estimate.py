@@ -86,12 +86,19 @@ def estimate(  # noqa: PLR0913 - all but the images are keyword-only and optiona
         backend = Backend(model=model, threads=threads, provider=provider)
         sphere = _request_window(projection, look_deg, fov_deg, lens_fov_deg)
         request = _make_request(align, calibration, format, sphere)
-        if right is None:
-            return _match_one_file(left, backend, options, request)
-        if isinstance(left, str | Path) and isinstance(right, str | Path):
-            return _match_two_files(Path(left), Path(right), backend, options, request)
-        given = StereoPair(left=as_rgb(left, "left"), right=as_rgb(right, "right"))
-        return _match_images(given, backend, options, request)
+        return _match_given(left, right, backend, options, request)
+
+
+def _match_given(
+    left: ImageLike, right: ImageLike | None, backend: Backend, options: MatchOptions, request: Request
+) -> Estimate:
+    """Match the pair in one file, in two files, or of two images."""
+    if right is None:
+        return _match_one_file(left, backend, options, request)
+    if isinstance(left, str | Path) and isinstance(right, str | Path):
+        return _match_two_files(Path(left), Path(right), backend, options, request)
+    given = StereoPair(left=as_rgb(left, "left"), right=as_rgb(right, "right"))
+    return _match_images(given, backend, options, request)
 
 
 def _match_one_file(file: ImageLike, backend: Backend, options: MatchOptions, request: Request) -> Estimate:
