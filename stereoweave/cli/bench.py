@@ -68,6 +68,14 @@ SparsificationPlot = Annotated[
     ),
 ]
 CsvFile = Annotated[Path, typer.Option("--out", "-o", help="CSV file to write.")]
+HeldOutPairs = Annotated[
+    Path | None,
+    typer.Option(
+        "--pairs",
+        metavar="FOLDER",
+        help="Folder of the held-out pairs; missing ones are created (default: pairs, beside the first run).",
+    ),
+]
 Models = Annotated[
     list[str] | None,
     typer.Option(help="Network, as for stereoweave depth. Repeatable (default: all shipped networks)."),
@@ -239,14 +247,7 @@ def networks(
         typer.Argument(metavar="RUN...", help="Run folders of stereoweave train, or checkpoints."),
     ],
     out: CsvFile = Path("networks.csv"),
-    pairs: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FOLDER",
-            help="Folder of the held-out pairs; missing ones are created (default: pairs, beside the first "
-            "run).",
-        ),
-    ] = None,
+    pairs: HeldOutPairs = None,
 ) -> None:
     """Score trained networks on their held-out pairs.
 
@@ -290,16 +291,20 @@ def parity(
 def training(
     run: Annotated[
         Path,
-        typer.Argument(help="Run folder of stereoweave train, or with --recipe of recipes/gpu/train.py."),
+        typer.Argument(
+            help="Run folder of stereoweave train; or with --recipe, a run folder of recipes/gpu/train.py "
+            "or a checkpoint."
+        ),
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="CSV file to write; rows of other runs are kept.")],
     recipe: Annotated[
         Path | None,
         typer.Option(
             metavar="RECIPE",
-            help="Score a run of recipes/gpu/train.py on the held-out pairs and sets of this recipe.",
+            help="Score the network on the held-out pairs and sets of this recipe.",
         ),
     ] = None,
+    pairs: HeldOutPairs = None,
 ) -> None:
     """Record a run's learning curve, and fit power laws to it.
 
@@ -311,9 +316,10 @@ def training(
 
     with require_train_extra():
         from stereoweave.learn.recipe import read_recipe
-        from stereoweave.learn.training.curves import record_curve, record_timed_run
+        from stereoweave.learn.training.curves import record_curve, record_network
     if recipe is not None:
-        for name, score in record_timed_run(run, read_recipe(recipe), out, Console()).items():
+        pairs = pairs or run.parent / "pairs"
+        for name, score in record_network(run, read_recipe(recipe), pairs, out, Console()).items():
             typer.echo(f"{name}: {score:.5g}")
         return
     for name, law in record_curve(run, out).items():

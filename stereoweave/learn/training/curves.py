@@ -12,6 +12,7 @@ from rich.console import Console
 from stereoweave.errors import Remedy, StereoweaveError
 from stereoweave.io.files import replacing
 from stereoweave.learn import checkpoint
+from stereoweave.learn.checkpoint import Checkpoint
 from stereoweave.learn.data.sources import cache_pairs, open_held_out_sets, open_sources
 from stereoweave.learn.devices import choose_device, describe_device
 from stereoweave.learn.recipe import Recipe
@@ -48,11 +49,12 @@ def record_curve(run: Path, out: Path) -> dict[str, PowerLaw]:
         out: CSV file to write, with recipe, step, pairs seen, scores, commit and machine.
 
     Raises:
-        StereoweaveError: If the run has no scores yet, or is a timed run.
+        StereoweaveError: If the run has no scores yet, is a timed run, or is the file of a network.
     """
-    if (run / PROGRESS_FILE).exists():
+    if run.is_file() or (run / PROGRESS_FILE).exists():
+        what = "network" if run.is_file() else "run of recipes/gpu/train.py"
         raise StereoweaveError(
-            f"{run}: expected a recipe for a run of recipes/gpu/train.py, found none",
+            f"{run}: expected a recipe for a {what}, found none",
             remedy=Remedy("give the recipe of its held-out pairs", ("recipe",)),
         )
     kept, record = checkpoint.load(run / "last.pt"), read_scores(run / SCORES_FILE)
@@ -63,40 +65,55 @@ def record_curve(run: Path, out: Path) -> dict[str, PowerLaw]:
     rows = [
         _make_row(run, round(scores["step"] * kept.recipe.batch), scores, kept.commit) for scores in record
     ]
-    _write(out, [*(row for row in _read(out) if row["recipe"] != run.name), *rows])
+    _write(out, [*(row for row in _read(out) if row["recipe"] != _name(run)), *rows])
     return _fit_curves(rows)
 
 
-def record_timed_run(run: Path, recipe: Recipe, out: Path, console: Console) -> dict[str, float]:
-    """Score a timed run on a recipe's held-out pairs, and write the row to a CSV file. Returns the scores.
+def record_network(
+    source: Path, recipe: Recipe, pairs: Path, out: Path, console: Console
+) -> dict[str, float]:
+    """Score a network on a recipe's held-out pairs, and write the row to a CSV file. Returns the scores.
 
-    All other rows of the file are kept and come first. Missing held-out collages are painted into the folder
-    `pairs` beside the run's.
+    All other rows of the file are kept and come first.
 
     Args:
-        run: Folder with the network and the progress of a timed run.
+        source: Folder of a timed run, or a checkpoint, whose steps and pairs are those of its last recipe.
         recipe: Recipe of the held-out pairs and sets.
+        pairs: Folder of the held-out collages; missing ones are painted.
         out: CSV file to write, with the columns of `record_curve`.
         console: Console for the progress of missing held-out collages.
 
     Raises:
         FormatError: A file of the run or a held-out set is missing or broken.
     """
-    kept, progress = checkpoint.load(run / NETWORK_FILE), read_progress(run / PROGRESS_FILE)
-    _, held_out = open_sources(replace(recipe, mix=()), run.parent / "pairs")  # no training sets are needed
+    kept, steps, seen = _load_network(source)
+    _, held_out = open_sources(replace(recipe, mix=()), pairs)  # no training sets are needed
     sets, device = open_held_out_sets(recipe), choose_device()
     cache_pairs(held_out, console)
     network = kept.build_averaged().to(device)
     scores = validate(network, held_out, device) | validate_sets(network, sets, device)
-    row = _make_row(run, progress.pairs, {"step": progress.steps, **scores}, kept.commit)
-    others = [one for one in _read(out) if (one["recipe"], one["step"]) != (run.name, str(progress.steps))]
+    row = _make_row(source, seen, {"step": steps, **scores}, kept.commit)
+    others = [one for one in _read(out) if (one["recipe"], one["step"]) != (_name(source), str(steps))]
     _write(out, [*others, row])
     return scores
 
 
+def _load_network(source: Path) -> tuple[Checkpoint, int, int]:
+    """Return a network, and the steps and pairs of its training."""
+    if source.is_file():
+        kept = checkpoint.load(source)
+        return kept, kept.step, kept.step * kept.recipe.batch
+    progress = read_progress(source / PROGRESS_FILE)
+    return checkpoint.load(source / NETWORK_FILE), progress.steps, progress.pairs
+
+
+def _name(source: Path) -> str:
+    return source.name.removesuffix(".pt")
+
+
 def _make_row(run: Path, pairs: int, scores: dict[str, float], commit: str) -> dict[str, Any]:
     return {
-        "recipe": run.name,
+        "recipe": _name(run),
         "pairs": pairs,
         **{name: round(value, 5) for name, value in scores.items()},
         "step": round(scores["step"]),

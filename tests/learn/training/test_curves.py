@@ -19,7 +19,7 @@ from stereoweave.cli.root import main
 from stereoweave.learn import checkpoint
 from stereoweave.learn.data.pair_cache import CachedPairs
 from stereoweave.learn.data.sources import VALIDATION_SEED
-from stereoweave.learn.training.curves import fit_power_law, record_curve, record_timed_run
+from stereoweave.learn.training.curves import fit_power_law, record_curve, record_network
 from stereoweave.learn.training.loop import SCORES_FILE, append_scores
 from stereoweave.learn.training.scores import validate
 from stereoweave.learn.training.timed_run import NETWORK_FILE, PROGRESS_FILE, RunProgress
@@ -95,7 +95,7 @@ def test_a_timed_run_has_the_scores_of_its_network_and_the_pairs_of_its_progress
     out.write_text("recipe,step,epe_px\nearlier,7,3.5\non_a_gpu,2,8.8\non_a_gpu,7,9.9\n")
     boxes = write_box_set(tmp_path / "boxes")
     recipe = replace(RECIPE, mix=(("not_here", 1.0),), held_out=(("boxes", str(boxes)),))
-    scores = record_timed_run(timed_run, recipe, out, Console(quiet=True))
+    scores = record_network(timed_run, recipe, tmp_path / "pairs", out, Console(quiet=True))
     with out.open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [(row["recipe"], row["step"], row["pairs"]) for row in rows] == [
@@ -125,3 +125,22 @@ def test_a_timed_run_needs_a_recipe(timed_run, tmp_path, capsys):
     assert complaint(record_curve, timed_run, curve) == f"{message}{advice} (recipe)"
     assert main(["bench", "training", str(timed_run), "-o", str(curve)]) == 2
     assert f"{message}{advice} (--recipe)" in capsys.readouterr().err
+
+
+def test_a_checkpoint_has_the_scores_of_its_network_and_the_pairs_of_its_recipe(tmp_path, capsys):
+    network, curve = tmp_path / "kept.pt", tmp_path / "curve.csv"
+    checkpoint.save(checkpoint_of(untrained()), network)
+    pairs = keep_pairs(tmp_path / "collages", VALIDATION_SEED, RECIPE.validation_pairs)
+    recipe = write(RECIPE, tmp_path / "tiny.toml")
+    line = ["bench", "training", str(network), "-o", str(curve)]
+    assert main([*line, "--recipe", str(recipe), "--pairs", str(tmp_path / "collages")]) == 0
+    with curve.open(newline="") as file:
+        (row,) = csv.DictReader(file)
+    # 20 steps with batches of 2.
+    assert (row["recipe"], row["step"], row["pairs"]) == ("kept", "20", "40")
+    expected = validate(untrained(), pairs, torch.device("cpu"))
+    assert float(row["epe_px"]) == pytest.approx(expected["epe_px"], abs=1e-5)
+    capsys.readouterr()
+    assert main(line) == 2
+    message = f"{network}: expected a recipe for a network, found none"
+    assert message in capsys.readouterr().err
