@@ -251,9 +251,9 @@ def measure(  # noqa: PLR0913 - each is an option of the command line
 
 
 def _list_files(out: Path) -> dict[str, str]:
-    from stereoweave.outputs.results import FILES
+    from stereoweave.outputs.results import list_results
 
-    return {file: str(out / file) for file in FILES if (out / file).exists()}
+    return {file: str(out / file) for file in list_results(out)}
 
 
 def _print_json(summary: "Summary", notes: list[str], out: Path) -> None:

@@ -1,7 +1,9 @@
 """Replacement of all files of a result in a folder together."""
 
+import os
 import tempfile
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -17,13 +19,14 @@ def replacing_together(
     """Yield a temporary folder whose files are moved to `out` at the end; an error leaves `out` unchanged.
 
     Files of an earlier result that the new result lacks are removed, so that all output files in `out` belong
-    to the same result. In a folder without an earlier result, files with these names are taken to be the
-    user's and are kept.
+    to the same result. All other files are taken to be the user's and are kept. The files of a result all
+    have the same time of change, by which they are recognised.
 
     Args:
         out: Folder of the result; made if it is missing.
         names: All files that a result can have.
-        written: The files that this result has. One that exists without an earlier result is an error.
+        written: The files that this result may have. One that exists and is not of an earlier result is an
+            error.
         marks: The files by which an earlier result is recognised: it has the first and, if there are more,
             one of the others. Empty for a folder in which all files are of earlier results.
 
@@ -32,30 +35,36 @@ def replacing_together(
         StereoweaveError: `out` or one of the files cannot be written, or would replace a file of the user's.
     """
     standing = make_parent_folder(*(out / name for name in names))
-    if not _has_result(out, marks):
-        _refuse_others(out, written)
+    _refuse_others(out, set(written) - find_result(out, names, marks))
     with tempfile.TemporaryDirectory(prefix=".stereoweave-", dir=standing) as folder:
         yield Path(folder)
+        fresh = [name for name in names if Path(folder, name).exists()]
+        now_ns = time.time_ns()
+        for name in fresh:
+            os.utime(Path(folder, name), ns=(now_ns, now_ns))
         # Without the lock, two commands could leave a mixture of their files.
         with lock_output(make_folder(out)):
-            is_earlier_result = _has_result(out, marks)
-            # The marks first, so that a result is recognised even if this process is killed in between.
-            for name in sorted(names, key=lambda name: name not in marks):
-                fresh = Path(folder, name)
-                if fresh.exists():
-                    fresh.replace(out / name)
-                elif is_earlier_result:
-                    (out / name).unlink(missing_ok=True)
+            # The marks are replaced first, and no other old file stays until then, so that a result is
+            # recognised even if this process is killed in between.
+            kept = {name for name in fresh if name in marks or not marks}
+            for name in find_result(out, names, marks) - kept:
+                (out / name).unlink()
+            for name in sorted(fresh, key=lambda name: name not in marks):
+                Path(folder, name).replace(out / name)
 
 
-def _has_result(out: Path, marks: Sequence[str]) -> bool:
-    there = [(out / name).exists() for name in marks]
-    return not there or (there[0] and (len(there) == 1 or any(there[1:])))
+def find_result(out: Path, names: Sequence[str], marks: Sequence[str]) -> set[str]:
+    """Return the files of the result in a folder; see `replacing_together`."""
+    changed_ns = {name: (out / name).stat().st_mtime_ns for name in names if (out / name).exists()}
+    if not marks:
+        return {*changed_ns}
+    found = {name for name, at_ns in changed_ns.items() if at_ns == changed_ns.get(marks[0])}
+    return found if len(marks) == 1 or found.intersection(marks[1:]) else set()
 
 
-def _refuse_others(out: Path, written: Sequence[str]) -> None:
-    """Raise StereoweaveError if `out` has one of the files to write."""
-    for name in written:
+def _refuse_others(out: Path, names: Iterable[str]) -> None:
+    """Raise StereoweaveError if `out` has one of these files."""
+    for name in sorted(names):
         if (out / name).exists():
             raise StereoweaveError(
                 f"{out / name}: expected no file, or one of an earlier result, "

@@ -31,7 +31,7 @@ from stereoweave.io.maps import (
     write_pfm,
     write_scaled_disparity_png,
 )
-from stereoweave.io.results_folder import replacing_together
+from stereoweave.io.results_folder import find_result, replacing_together
 from stereoweave.matching.backend import Backend
 from stereoweave.matching.options import MatchOptions
 from stereoweave.outputs.point_cloud import (
@@ -154,11 +154,18 @@ def make_depth(pictures: Sequence[Path], out: Path, job: DepthJob, *, owns_out: 
         compile_ahead(rehearse_drawing, rehearse_filling)
     if not owns_out:
         refuse_inputs((out / file for file in FILES), pictures)
-    with replacing_together(out, tuple(FILES), files, () if owns_out else _MARKS) as folder:
+    possible = [*files, SCALED] if "disparity.png" in files else files
+    with replacing_together(out, tuple(FILES), possible, () if owns_out else _MARKS) as folder:
         result = run(prepared, matcher, job.options)
         result = replace(result, command=job.command, name_of=job.name_of)
         notes = [*result.notes, *left_out, *write_files(folder, files, result)]
         return DepthOutcome(result.summary, notes, result.warnings())
+
+
+def list_results(out: Path) -> list[str]:
+    """Return the names of the files of the result that `make_depth` wrote to `out`."""
+    found = find_result(out, tuple(FILES), _MARKS)
+    return [file for file in FILES if file in found]
 
 
 def job_facts(job: DepthJob) -> dict[str, Any]:

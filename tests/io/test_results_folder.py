@@ -1,3 +1,5 @@
+import shutil
+
 import pytest
 
 from stereoweave.errors import StereoweaveError
@@ -41,6 +43,23 @@ def test_a_users_own_files_beside_no_earlier_result_are_kept(tmp_path):
     (tmp_path / "notes.json").write_text("own")
     write_result(tmp_path, {"map.pfm": "1"})
     assert read_all(tmp_path) == {"map.pfm": "1", "notes.json": "own"}
+
+
+def test_a_users_own_file_that_a_result_left_alone_is_kept_by_the_next_one_too(tmp_path):
+    (tmp_path / "notes.json").write_text("own")
+    for text in ("1", "2"):
+        write_result(tmp_path, {"map.pfm": text, "map.png": text})
+    assert read_all(tmp_path) == {"map.pfm": "2", "map.png": "2", "notes.json": "own"}
+    with pytest.raises(StereoweaveError, match="notes.json: expected no file, or one of an earlier result"):
+        write_result(tmp_path, {"map.pfm": "3", "map.png": "3", "notes.json": "3"})
+    assert read_all(tmp_path) == {"map.pfm": "2", "map.png": "2", "notes.json": "own"}
+
+
+def test_a_copied_result_is_recognised_if_the_copy_keeps_its_times(tmp_path):
+    write_result(tmp_path / "out", {"map.pfm": "1", "map.png": "1"})
+    copied = shutil.copytree(tmp_path / "out", tmp_path / "copied")
+    write_result(copied, {"map.pfm": "2", "map.png": "2"})
+    assert read_all(copied) == {"map.pfm": "2", "map.png": "2"}
 
 
 @pytest.mark.parametrize("name", ["map.pfm", "map.png"])

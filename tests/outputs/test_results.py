@@ -1,4 +1,5 @@
 import html
+import json
 import re
 import shlex
 import sys
@@ -141,6 +142,22 @@ def test_files_with_the_same_names_that_are_not_an_earlier_result_stay(folder):
         Path(name).write_text("of another program")
     make_depth(PICTURES, Path(), PLAIN)
     assert {Path(name).read_text() for name in ("mesh.ply", "depth.npy")} == {"of another program"}
+
+
+def test_a_file_that_only_some_results_have_is_not_replaced_and_not_listed(folder, capfd):
+    left = read_image("left.png")
+    write_image("right.png", np.roll(left, 8, axis=1))  # disparities of -8 px, for which there is no PNG
+    plain = replace(PLAIN, request=Request(rectify=False))
+    Path("out").mkdir()
+    Path("out/disparity_scaled.png").write_text("of another program")
+    with pytest.raises(StereoweaveError, match="^out/disparity_scaled.png: .* a file of another origin"):
+        make_depth(PICTURES, Path("out"), plain)
+    Path("out/disparity_scaled.png").rename("out/mesh.ply")
+    for _ in range(2):
+        main(["depth", *map(str, PICTURES), "--no-rectify", "--model", "small", "-o", "out", "--json"])
+        files = json.loads(capfd.readouterr().out)["files"]
+        assert "disparity_scaled.png" in files and "mesh.ply" not in files
+    assert Path("out/mesh.ply").read_text() == "of another program"
 
 
 def test_ground_truth_and_inputs_are_not_replaced(folder):
