@@ -188,7 +188,7 @@ class StereoVideo:
         Raises:
             StereoweaveError: The video ends before the part begins.
         """
-        first = math.ceil(start_s * self.rate)
+        first = self._count_frames(start_s)
         if not 0 <= first < self.frame_count:
             length = format_frame_time(self.frame_count / self.rate)
             raise StereoweaveError(
@@ -196,10 +196,14 @@ class StereoVideo:
             )
         part = copy.copy(self)
         part._first = self._first + first
-        part.frame_count = min(math.ceil(length_s * self.rate), self.frame_count - first)
+        part.frame_count = min(self._count_frames(length_s), self.frame_count - first)
         part.excerpted = f"{part._first}+{part.frame_count}"
         part.sound = None
         return part
+
+    def _count_frames(self, length_s: float) -> int:
+        """Return the number of frames that begin before this time; a decimal time may be off by rounding."""
+        return math.ceil(round(length_s * float(self.rate), 6))
 
     def frames(self, start: int = 0) -> Iterator[StereoFrame]:
         """Yield the frames from number `start` on, the same as if reading had begun at the first frame.

@@ -16,6 +16,10 @@ if TYPE_CHECKING:
 # Type of the first box in an MP4 or MOV file, which follows the four bytes of the box's length.
 _MP4_BOXES = b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot"
 
+# Formats of files that name others, which FFmpeg would read wherever they lie, and how two of them begin.
+_REFERRING = {"hls", "dash", "concat", "imf"}
+_PLAYLISTS = b"#EXTM3U", b"ffconcat"
+
 # FFmpeg's AV_DISPOSITION_ATTACHED_PIC and AV_DISPOSITION_TIMED_THUMBNAILS.
 _SINGLE_PICTURES = 0x400 | 0x800
 
@@ -62,8 +66,9 @@ def open_container(path: Path) -> "av.container.InputContainer":
     check_readable(path, "a video")
     with require_extra("video", f"{path}: reading video needs PyAV"):
         import av
+    own_content = ",".join(sorted(av.formats_available - _REFERRING))
     try:
-        return av.open(str(path), metadata_errors="replace")
+        return av.open(str(path), metadata_errors="replace", options={"format_whitelist": own_content})
     except av.error.FFmpegError as error:
         raise FormatError(f"{path}: expected a video, found {_describe_unopened(path, error)}") from error
 
@@ -128,6 +133,8 @@ def _describe_unopened(path: Path, error: "av.error.FFmpegError") -> str:
         beginning = file.read(8)
         if not beginning:
             return "an empty file"
+    if beginning.startswith(_PLAYLISTS):
+        return "a playlist, which names other files; give the video itself"
     found = f"none that FFmpeg can open ({describe_error(error)})"
     if beginning[4:] in _MP4_BOXES:
         found += "; if the file was cut off, its index is lost: record or download it again"

@@ -30,6 +30,7 @@ from jaxtyping import UInt8, UInt16
 from stereoweave.errors import Remedy, StereoweaveError
 from stereoweave.io.files import replacing
 from stereoweave.video.mp4_marks import VideoMarks, show_bounds, write_marks
+from stereoweave.video.streams import open_container
 
 if TYPE_CHECKING:  # PyAV's types have parameters that its classes lack
     from av.packet import Packet
@@ -214,7 +215,7 @@ class Recorder:
                 stream.metadata["stereo_mode"] = self.packing.stereo_mode
             start_s, sound_packets = Fraction(0), []
             if sound:
-                source = stack.enter_context(av.open(str(sound)))
+                source = stack.enter_context(open_container(sound))
                 start_s = _find_start_s(source.streams.best("video"))
                 sound_packets = [_read_sound(source, _copy_sound_streams(source, container))]
             # Merge the packets by time, because the muxer buffers packets that are ahead of other streams.

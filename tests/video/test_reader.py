@@ -252,6 +252,24 @@ def test_a_path_without_a_video_is_refused_in_one_line(tmp_path):
     assert "index" not in refusal(tmp_path / "missing.mp4")
 
 
+@pytest.mark.parametrize(
+    ("name", "beginning"),
+    [
+        ("a.m3u8", "#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\n"),
+        ("a.ffconcat", "ffconcat version 1.0\nfile "),
+    ],
+)
+def test_a_playlist_does_not_read_the_files_that_it_names(tmp_path, name, beginning):
+    secret = write_side_by_side(tmp_path / "secret.mp4", flat_pairs(3), codec="libx264")
+    playlist = tmp_path / "other" / name
+    playlist.parent.mkdir()
+    for place in (secret.name, str(secret)):
+        playlist.write_text(f"{beginning}{place}\n")
+        assert refusal(playlist) == (
+            f"{playlist}: expected a video, found a playlist, which names other files; give the video itself"
+        )
+
+
 def test_frames_without_time_stamps_are_timed_by_the_frame_rate(tmp_path):
     pairs = example_pairs(9)
     for name, options in (("video.avi", {"bf": "2"}), ("video.m4v", {}), ("video.h264", {})):
@@ -514,6 +532,12 @@ def test_an_excerpt_after_a_key_frame_without_a_time_stamp_has_the_frames_of_the
     part = list(video.excerpt(0.36, 0.12).frames())  # frames 9 to 11 of 25 a second
     assert_same(part, [frame._replace(time=frame.time - whole[9].time) for frame in whole[9:]])
     assert [frame.problem for frame in part] == [None, None, None]
+
+
+def test_an_excerpt_begins_at_the_frame_of_a_time_that_no_float_has(tmp_path):
+    video = open_video([write_side_by_side(tmp_path / "video.mkv", flat_pairs(56))], "side_by_side")
+    assert 2.2 * 25 > 55
+    assert video.excerpt(2.2, 0.04).excerpted == "55+1"
 
 
 def test_an_excerpt_ends_with_its_video(tmp_path):
