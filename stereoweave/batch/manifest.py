@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io.stores import Store, store_at
-from stereoweave.pictures.pair_finding import ListedPair, find_pairs_among, note_left_out
+from stereoweave.pictures.pair_finding import ListedPair, find_pairs_among, note_listing
 
 if TYPE_CHECKING:
     import pyarrow
@@ -90,7 +90,7 @@ def extend_plan(source: Store, destination: Store, workers: int) -> ChunkPlan:
     # extended the plan at the same time.
     for stray in set(_list_parts(destination, MANIFEST)).difference(numbers):
         destination.remove(_part_path(MANIFEST, stray))
-    return ChunkPlan(numbers, sum(map(sum, counts.values())), note_left_out(source.place, listed.left_out))
+    return ChunkPlan(numbers, sum(map(sum, counts.values())), note_listing(source.place, listed))
 
 
 def read_chunk(destination: Store, chunk: int) -> list[PlanEntry]:

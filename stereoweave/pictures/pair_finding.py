@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain, repeat, takewhile
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from posixpath import splitext
 from typing import NamedTuple
 
@@ -158,7 +158,7 @@ def find_pairs_in(folder: Path) -> FoundPairs:
         )
         for pair in listed.pairs
     ]
-    return FoundPairs(pairs, (*_note_unmarked(folder, pairs), *note_left_out(folder, listed.left_out)))
+    return FoundPairs(pairs, note_listing(folder, listed))
 
 
 def find_pairs_among(folder: str | Path, paths: Iterable[str]) -> Listed:
@@ -199,10 +199,16 @@ def find_pairs_among(folder: str | Path, paths: Iterable[str]) -> Listed:
     return Listed(pairs, films, rest)
 
 
-def _note_unmarked(folder: Path, pairs: Sequence[NamedPair]) -> tuple[str, ...]:
+def note_listing(folder: str | Path, listed: Listed) -> tuple[str, ...]:
+    """Return notes on what the names of a folder's pictures mean, where that may not be intended."""
+    return (*_note_unmarked(folder, listed.pairs), *_note_left_out(folder, listed.left_out))
+
+
+def _note_unmarked(folder: str | Path, pairs: Sequence[ListedPair]) -> tuple[str, ...]:
     """Return a note if every picture is taken to hold both views, because none has a side in its name."""
-    suffixes = {picture.suffix.lower() for pair in pairs for picture in pair.pictures}
-    if any(len(pair.pictures) == 2 for pair in pairs) or suffixes & {*_ENDINGS["both views"]}:
+    suffixes = {PurePosixPath(file).suffix.lower() for pair in pairs for file in pair.files}
+    in_two = any(len(pair.files) == 2 for pair in pairs)
+    if not pairs or in_two or suffixes & {*_ENDINGS["both views"]}:
         return ()
     return (
         f"{folder}: no two names differ in left and right alone, as 1_L.jpg and 1_R.jpg do, so each picture "
@@ -210,7 +216,7 @@ def _note_unmarked(folder: Path, pairs: Sequence[NamedPair]) -> tuple[str, ...]:
     )
 
 
-def note_left_out(folder: str | Path, pictures: Sequence[str]) -> tuple[str, ...]:
+def _note_left_out(folder: str | Path, pictures: Sequence[str]) -> tuple[str, ...]:
     """Return a note on a folder's pictures without a partner, if there are any."""
     if not pictures:
         return ()
