@@ -7,7 +7,6 @@ are matched together.
 import asyncio
 import logging
 import math
-import os
 import socket
 import time
 from collections.abc import Iterator, Sequence
@@ -34,7 +33,14 @@ from stereoweave.service.folders import make_own_folder
 from stereoweave.service.replica_processes import ReplicaProcesses, TimedJob
 from stereoweave.service.server import ClientTimeouts, run_http_server
 from stereoweave.system.child_process import ProcessDiedError
-from stereoweave.system.ray_engine import Engine, call_on_each_machine, connect, count_cores, count_slots
+from stereoweave.system.ray_engine import (
+    Engine,
+    call_on_each_machine,
+    connect,
+    count_cores,
+    count_slots,
+    set_environment,
+)
 from stereoweave.system.threads import usable_cores
 
 NAME = "stereoweave"
@@ -186,7 +192,7 @@ def run_service(settings: Settings, listener: socket.socket, address: str | None
     Raises:
         StereoweaveError: If the replicas do not fit, Ray cannot be reached, or the network does not load.
     """
-    address = address or os.environ.get("RAY_ADDRESS")
+    address = set_environment(address)
     engine = Engine(address, cpus_each=settings.threads, gpus_each=settings.gpus_each)
     if address is None:
         _check_slots(settings, usable_cores() // settings.threads)

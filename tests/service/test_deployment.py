@@ -57,7 +57,9 @@ def service(running) -> httpx.Client:
 @pytest.fixture(scope="module")
 def running(tmp_path_factory) -> Iterator[Running]:
     limits = ["--waiting", WAITING, "--max-megabytes", MEGABYTES, "--max-megapixels", 1, "--timeout-s", 20]
-    with run_serve_command(tmp_path_factory.mktemp("uploads"), "--batch", 2, *limits) as running:
+    # local is the default, too.
+    words = ["--address", "local", "--batch", 2, *limits]
+    with run_serve_command(tmp_path_factory.mktemp("uploads"), *words) as running:
         yield running
 
 
