@@ -9,7 +9,7 @@ from stereoweave.errors import FormatError
 from stereoweave.matching.options import MatchOptions
 from stereoweave.pictures.prepare import Request
 from stereoweave.service.answers import BatchAnswerer, ServiceAnswer, ServiceJob, load_measurer
-from stereoweave.system.child_process import ChildProcess, ProcessDiedError
+from stereoweave.system.child_process import ChildProcess, NotStartedError, ProcessDiedError
 
 # Reading a picture's header takes milliseconds.
 _MEASURING_LIMIT_S = 10
@@ -80,6 +80,8 @@ class ReplicaProcesses:
         """
         try:
             return self._measurer(job, min(left_s, _MEASURING_LIMIT_S))
+        except NotStartedError:
+            raise
         except TimeoutError as error:
             if left_s < _MEASURING_LIMIT_S:
                 raise

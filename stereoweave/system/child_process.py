@@ -25,6 +25,10 @@ class ProcessDiedError(StereoweaveError):
     """Error for a process that exited in the middle of a call, because it crashed or memory ran out."""
 
 
+class NotStartedError(TimeoutError):
+    """Error for a call that was not begun in time: the process was still starting, or no time was left."""
+
+
 class ChildProcess:
     """A function that runs in a child process, one call at a time.
 
@@ -43,24 +47,24 @@ class ChildProcess:
         """Call the function for at most `timeout_s` seconds, and return its result.
 
         Raises:
-            TimeoutError: If the process has not started in time, or the call takes too long. In the latter
-                case, the process is replaced.
+            NotStartedError: If the process has not started in time, or no time is left.
+            TimeoutError: If the call takes too long; the process is then replaced.
             ProcessDiedError: If the process exits on its own; it is then replaced.
             Exception: Any error that the function or `make` raises.
         """
         start_s = time.monotonic()
         wait([self._started], timeout_s)
         left_s = None if timeout_s is None else start_s + timeout_s - time.monotonic()
-        late = TimeoutError(f"expected a result within {timeout_s or 0:.3g} s, found none")
+        late = f"expected a result within {timeout_s or 0:.3g} s, found none"
         if not self._started.done() or (left_s is not None and left_s <= 0):
-            raise late
+            raise NotStartedError(late)
         self._open(self._started)
         self._make_folder()
         reply = self._exchanges.submit(_exchange, self._process, pickle.dumps(argument))
         wait([reply], left_s)
         if not reply.done():
             self._replace()
-            raise late
+            raise TimeoutError(late)
         return self._open(reply)
 
     @property

@@ -8,6 +8,7 @@ import pytest
 
 from stereoweave.errors import FormatError, MatcherError
 from stereoweave.matching.backend import Backend
+from stereoweave.service import replica_processes
 from stereoweave.service.answers import BatchAnswerer, ServiceAnswer, ServiceJob, load_answerer
 from stereoweave.service.replica_processes import ReplicaProcesses, TimedJob
 
@@ -54,7 +55,7 @@ def list_names(outcomes: Sequence[ServiceAnswer | Exception]) -> list[str]:
 def test_a_job_that_misses_its_deadline_is_ended_and_the_others_are_answered(processes):
     start_s = time.monotonic()
     outcomes = processes.answer([make_job("first"), make_job("sleep", within_s=0.3), make_job("second")])
-    assert list_names(outcomes) == ["first", "TimeoutError", "second"]
+    assert list_names(outcomes) == ["first", "NotStartedError", "second"]
     assert time.monotonic() - start_s < 20
     assert str(outcomes[1]).startswith("expected a result within")
 
@@ -66,7 +67,7 @@ def test_a_crash_is_reported_in_one_line_and_the_other_jobs_are_answered(process
 
 
 def test_a_job_past_its_deadline_is_not_started(processes):
-    assert list_names(processes.answer([make_job("first", within_s=-1)])) == ["TimeoutError"]
+    assert list_names(processes.answer([make_job("first", within_s=-1)])) == ["NotStartedError"]
     assert list_names(processes.answer([make_job("second")])) == ["second"]
 
 
@@ -92,6 +93,14 @@ def test_pictures_are_measured_from_their_headers(processes, tmp_path):
 def test_a_picture_whose_header_cannot_be_read_in_time_is_refused(processes):
     with pytest.raises(TimeoutError):
         processes.measure(make_job().job, left_s=0)
+
+
+def test_a_picture_is_not_blamed_for_a_process_that_is_still_starting(tmp_path, monkeypatch):
+    monkeypatch.setattr(replica_processes, "_MEASURING_LIMIT_S", 0.01)
+    processes = ReplicaProcesses(load_named_answerer, tmp_path / "files")
+    with pytest.raises(TimeoutError, match="expected a result within"):
+        processes.measure(make_job().job, left_s=60)
+    processes.close()
 
 
 def test_a_network_that_cannot_be_loaded_is_reported_before_any_job(tmp_path):

@@ -12,7 +12,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from stereoweave.system.child_process import ChildProcess, ProcessDiedError
+from stereoweave.system.child_process import ChildProcess, NotStartedError, ProcessDiedError
 
 pytestmark = pytest.mark.system
 
@@ -74,7 +74,7 @@ def test_a_process_that_is_still_starting_is_not_replaced(tmp_path):
     child = ChildProcess(partial(_sleep_then_make, 0.5), tmp_path / "files")
     pid = child.pid
     for _ in range(2):
-        with pytest.raises(TimeoutError):
+        with pytest.raises(NotStartedError):
             child(0, timeout_s=0.01)
     assert child(7, timeout_s=10) == 7
     assert child.pid == pid
