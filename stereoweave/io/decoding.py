@@ -423,8 +423,9 @@ def _seek(path: Path, picture: Image.Image, index: int) -> None:
     """Seek to a frame, and drop the tags and the profile of the previous one."""
     if picture.tell() == index:
         return
-    # A HEIC file replaces them all by itself, and would miss them when it comes back to the frame.
-    for key in ("mp", "icc_profile") if picture.format != heif.FORMAT else ():
+    # The frames of an MPO file have their own. Those of an animation share the file's, and a HEIC file
+    # replaces them by itself.
+    for key in ("mp", "icc_profile") if picture.format == "MPO" else ():
         picture.info.pop(key, None)
     try:
         with warnings.catch_warnings(action="ignore"):

@@ -711,7 +711,7 @@ def test_an_incomplete_vr180_photo_is_refused_by_its_name(tmp_path, pair, xmp, f
     assert "found a VR180 picture or a 360-degree panorama" in refusal(path, path)
 
 
-def write_animation_of(path, *images):
+def write_animation_of(path, *images, **options):
     first, *others = (Image.fromarray(image) for image in images)
     first.save(
         path,
@@ -719,6 +719,7 @@ def write_animation_of(path, *images):
         append_images=others,
         duration=100,
         **({"lossless": True} if path.suffix == ".webp" else {}),
+        **options,
     )
     return path
 
@@ -733,6 +734,17 @@ def test_an_animation_of_two_frames_is_a_pair(tmp_path, pair, ending, tolerance)
     ]
     with Image.open(path) as picture:
         assert pixel_factor(path, picture, None) == 2
+
+
+@pytest.mark.parametrize("ending", ["webp", "png"])
+def test_both_frames_of_an_animation_have_its_colour_profile(tmp_path, ending):
+    red = np.full((64, 96, 3), (234, 51, 35), np.uint8)
+    other = np.where(np.arange(96)[:, None] < 90, red, 0).astype(np.uint8)  # equal frames would become one
+    path = write_animation_of(tmp_path / f"a.{ending}", red, other, icc_profile=profile("P3", *DISPLAY_P3))
+    opened = open_pictures([path])
+    np.testing.assert_allclose(opened.pair.left[5, 5].astype(int), [255, 0, 0], atol=8)
+    np.testing.assert_array_equal(opened.pair.left[:, :90], opened.pair.right[:, :90])
+    assert "colours converted from P3" in map(str, opened.notes)
 
 
 def test_an_animation_of_two_frames_has_no_layout_and_is_no_single_picture(tmp_path, pair):
