@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from stereoweave.arguments import check_choice
 from stereoweave.cli.commands import running_options, shows_steps
 from stereoweave.cli.options import (
     AsJson,
@@ -33,6 +34,14 @@ Checked = Annotated[
         metavar="PICTURE",
         help="LEFT RIGHT, two pictures of the same size; one picture that holds both views; or a stereo "
         "video.",
+    ),
+]
+CheckedFormat = Annotated[
+    str | None,
+    typer.Option(
+        "--format",
+        help="Layout of a picture that holds both views, or frame packing of a video, such as side_by_side "
+        "or frame_sequential (default: detected). An unknown name lists them all.",
     ),
 ]
 Film = Annotated[
@@ -61,7 +70,7 @@ _RECTIFIED = ("rectified.json", "left.png", "right.png", "calib.yml")
 @shows_steps
 def check(  # noqa: PLR0913 - each is an option of the command line
     pictures: Checked,
-    format: Format = None,
+    format: CheckedFormat = None,
     projection: Projection = None,
     look: Look = None,
     fov: Fov = None,
@@ -77,19 +86,22 @@ def check(  # noqa: PLR0913 - each is an option of the command line
     eyes and near objects that a border cuts off, shot by shot. The exit status is 1 if there is a problem.
     """
     from stereoweave.cameras.alignment import check_pair
-    from stereoweave.pictures.loading import open_pictures
+    from stereoweave.pictures.loading import FORMATS, open_pictures
+    from stereoweave.video.packings import APART
     from stereoweave.video.reader import open_video
 
+    if format is not None:
+        check_choice("format", format, (*FORMATS, *sorted(APART)))
     sphere = make_sphere_request(projection, look, fov, lens_fov)
     try:
-        opened = None if film else open_pictures(pictures, format, sphere)
+        opened = None if film or format in APART else open_pictures(pictures, format, sphere)
     except FormatError as error:
         if not is_video(error):
             raise
         opened = None
     if opened is None:
-        name = ", ".join(picture.name for picture in pictures)
-        print_video_check(open_video(pictures, format, sphere=sphere), name, screen, timeline, as_json)
+        video = open_video(pictures, format, sphere=sphere)
+        print_video_check(video, pictures, screen, timeline, as_json)
         return
     refuse_video_options(screen, timeline)
     with step("checking the pair"):

@@ -27,31 +27,36 @@ def is_video(error: FormatError) -> bool:
 
 
 def print_video_check(
-    video: "StereoVideo", name: str, screen: str | None, timeline: Path | None, as_json: bool
+    video: "StereoVideo", sources: Sequence[Path], screen: str | None, timeline: Path | None, as_json: bool
 ) -> None:
     """Check a stereo video and print what its shots show; the exit status is 1 if there is a defect.
 
-    `name` is the title of the timeline.
+    `sources` are what the video was opened from; their names are the title of the timeline.
     """
     from rich.console import Console
 
     from stereoweave.io.animation import require_video_extra
+    from stereoweave.io.files import refuse_inputs
     from stereoweave.io.images import picture_kind, write_image
     from stereoweave.matching.backend import Backend
     from stereoweave.rendering.comfort import find_screen
     from stereoweave.system.progress import progress
+    from stereoweave.video.picture_track import list_picture_files
 
     if screen is not None:
         find_screen(screen)
     if timeline is not None:
         picture_kind(timeline)
         make_parent_folder(timeline)
+        files = [file for source in sources for file in list_picture_files(source) or [source]]
+        refuse_inputs([timeline], files, "timeline")
     with require_video_extra("a video"):
         from stereoweave.video.timeline import draw_timeline
         from stereoweave.video.video_check import check_video
     with progress(Console(stderr=True)) as bar:
         found = check_video(video, Backend(model="small").matcher(), bar, screen=screen)
     if timeline is not None:
+        name = ", ".join(source.name for source in sources)
         write_image(timeline, draw_timeline(found, name, screen))
     if as_json:
         typer.echo(json.dumps(_list_facts(found, video.size_px), indent=2, allow_nan=False))

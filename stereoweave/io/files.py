@@ -68,14 +68,14 @@ def make_parent_folder(*files: Path) -> Path:
     return make_folder(next(path for path in files[0].parents if path.exists() or path.is_symlink()))
 
 
-def refuse_inputs(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
-    """Raise StereoweaveError if an output would replace an input."""
+def refuse_inputs(outputs: Iterable[Path], inputs: Iterable[Path], setting: str = "out") -> None:
+    """Raise StereoweaveError if an output, named by this setting, would replace an input."""
     given = [path for path in inputs if path.exists()]
     for output in outputs:
         if output.exists() and any(output.samefile(path) for path in given):
             raise StereoweaveError(
                 f"{output}: expected a new file, found one of the inputs",
-                remedy=Remedy("choose another one", ("out",)),
+                remedy=Remedy("choose another one", (setting,)),
             )
 
 

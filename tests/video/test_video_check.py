@@ -14,6 +14,7 @@ from rich.progress import Progress
 from video_examples import TEXTURED, example_pairs, flat_pairs, truncate, write_side_by_side, write_video
 
 from stereoweave.cli.root import main
+from stereoweave.io.images import write_image
 from stereoweave.matching.matcher import Matcher
 from stereoweave.stereo import StereoPair
 from stereoweave.video.frame_check import check_frame, measure_bars
@@ -227,6 +228,27 @@ def test_the_timeline_names_the_file_without_its_folder(tmp_path):
         with Image.open(folder / "t.png") as picture:
             pictures.append(np.asarray(picture))
     np.testing.assert_array_equal(*pictures)
+
+
+def test_a_timeline_does_not_replace_a_frame(tmp_path, capsys):
+    for eye, pair in zip(("left", "right"), zip(*flat_pairs(2), strict=True), strict=True):
+        (tmp_path / eye).mkdir()
+        for number, image in enumerate(pair):
+            write_image(tmp_path / eye / f"{number}.png", image)
+    frame = tmp_path / "left" / "0.png"
+    before = frame.read_bytes()
+    assert run(tmp_path / "left", tmp_path / "right", "--film", "--timeline", frame) == 2
+    assert capsys.readouterr().err.endswith(
+        "0.png: expected a new file, found one of the inputs; choose another one (--timeline)\n"
+    )
+    assert frame.read_bytes() == before
+
+
+def test_a_packing_that_no_picture_has_means_a_video(tmp_path, capsys):
+    frames = [view for pair in example_pairs(3) for view in pair]
+    video = write_video(tmp_path / "in.mkv", frames, codec="ffv1")
+    run(video, "--format", "frame_sequential")
+    assert "shot" in capsys.readouterr().out
 
 
 def test_a_cut_file_is_checked_as_far_as_it_goes_and_says_so(tmp_path, capsys):
