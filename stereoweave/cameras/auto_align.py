@@ -58,14 +58,18 @@ def align(pair: StereoPair, *, always: bool = False, parallel: bool = False) -> 
     return replace(other, swapped=True, notes=(_SWAPPED, *other.notes))
 
 
-def align_rows(pair: StereoPair, *, parallel: bool = False) -> Aligned:
-    """Rectify a pair if its rows are apart, as `align` does, without swapping its sides."""
+def align_rows(pair: StereoPair, *, parallel: bool = False, keep_screen: bool = False) -> Aligned:
+    """Rectify a pair if its rows are apart, as `align` does, without swapping its sides.
+
+    With `keep_screen`, the median disparity stays, so that the same things are in front of the screen as in
+    the original pictures; the result has no camera.
+    """
     before = check_pair(pair.left, pair.right)
     as_it_is = Aligned(pair=pair, alignment=before)
     if not before.is_known or before.is_rectified:
         return as_it_is
     try:
-        rectified = _rectify(pair, parallel=parallel)
+        rectified = _rectify(pair, parallel=parallel, keep_screen=keep_screen)
     except StereoweaveError as error:
         note = Note(f"the pair could not be rectified: {error.message}", error.remedy)
         return replace(as_it_is, notes=(note,))
@@ -74,8 +78,10 @@ def align_rows(pair: StereoPair, *, parallel: bool = False) -> Aligned:
     return replace(rectified, notes=tuple(replace(note, remedy=KEEP) for note in rectified.notes))
 
 
-def _rectify(pair: StereoPair, *, parallel: bool) -> Aligned:
+def _rectify(pair: StereoPair, *, parallel: bool, keep_screen: bool = False) -> Aligned:
     fit = fit_warps(pair, parallel=parallel)
+    if keep_screen:
+        fit = fit.keep_screen()
     rectified = fit.apply(pair)
     alignment = check_pair(rectified.left, rectified.right)
     return Aligned(pair=rectified, alignment=alignment, notes=(fit.note,), warps=fit.warps)

@@ -68,6 +68,13 @@ class Fit:
         camera = self._warp_camera(pair.camera) if pair.camera and self.cameras.parallel else None
         return replace(apply_warps(pair, self.warps), camera=camera)
 
+    def keep_screen(self) -> "Fit":
+        """Return the fit whose right picture is moved sideways, so that the median disparity stays."""
+        aligned = self.warps.transform(self.matches)
+        nearer_px = float(np.median(aligned.disparity_px) - np.median(self.matches.disparity_px))
+        warps = Warps(self.warps.left, self.warps.right.shifted((nearer_px, 0.0)))
+        return replace(self, warps=warps, cameras=replace(self.cameras, parallel=False))
+
     def _warp_camera(self, camera: StereoCamera) -> StereoCamera:
         """Return the camera of the warped pair: turns keep a camera, but scaling and moving change it."""
         turned = self.cameras.make_warps().left.homography

@@ -68,7 +68,7 @@ def check_frame(frame: StereoFrame, matcher: Matcher) -> FrameCheck:
     whole = StereoPair(left=frame.left, right=frame.right)
     alignment = check_pair(whole.left, whole.right)
     # Swapped eyes stay so: a vote on single frames would swap some of a shot and not others.
-    aligned = align_rows(whole)
+    aligned = align_rows(whole, keep_screen=True)
     pair, scale = scale_down(aligned.pair)
     estimate = match(matcher, pair)
     gains = measure_gains(pair, estimate)

@@ -35,7 +35,7 @@ class ShotAligner:
         """Return the aligned frame of the current shot."""
         pair = swap(pair) if self._swapped else pair
         if not self._measured:
-            aligned = align_rows(pair)
+            aligned = align_rows(pair, keep_screen=True)
             self._measured, self._warps = aligned.alignment.is_known, aligned.warps
         if not self._warps:
             return pair

@@ -6,6 +6,7 @@ from camera_examples import Taken, take, turn
 
 from experiments.handheld.warps import rolling_shutter
 from stereoweave.cameras.alignment import check_pair
+from stereoweave.cameras.feature_matches import find_matches
 from stereoweave.learn.data.collage import paint_collage
 from stereoweave.stereo import StereoPair
 from stereoweave.video.shot_alignment import ShotAligner
@@ -41,6 +42,16 @@ def test_a_shot_keeps_its_rectification_until_the_next_one_begins(shots):
     assert not is_rectified(aligner(shots[1]))
     aligner.begin_shot()
     assert is_rectified(aligner(shots[1]))
+
+
+def test_a_rectified_shot_keeps_its_depth_about_the_screen(shots):
+    converged = StereoPair(left=shots[0].left, right=np.roll(shots[0].right, 30, axis=1))
+    before, after = (
+        np.median(find_matches(pair.left, pair.right).disparity_px)
+        for pair in (converged, ShotAligner()(converged))
+    )
+    assert before < -10
+    assert after == pytest.approx(before, abs=1)
 
 
 def test_a_shot_that_begins_plain_is_measured_at_its_first_frame_with_content(shots):
