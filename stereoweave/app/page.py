@@ -6,10 +6,6 @@ from stereoweave.app.events import LIFETIME_S, Host
 from stereoweave.app.pair_tab import PairTab
 from stereoweave.app.video_tab import VideoTab
 
-# Each session keeps its last result. It takes 60 MB plus 19 bytes per pixel of the left picture in memory
-# (0.5 GB at 24 megapixels), and the size of its files on disk (0.9 GB at 24 megapixels).
-_MOST_SESSIONS = 4
-
 _HEAD = """<div class="head"><h1>Stereoweave</h1>
 <p>Two pictures of one scene become depth, 3-D pictures, and the view from anywhere between the two cameras.
 The pictures stay on the computer that runs this page.</p></div>"""
@@ -34,5 +30,4 @@ def make_page(host: Host) -> gr.Blocks:
                 button.forget(visitor)
 
         blocks.unload(stop_work)
-    blocks.state_session_capacity = _MOST_SESSIONS
     return blocks.queue(default_concurrency_limit=1)

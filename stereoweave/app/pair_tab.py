@@ -1,7 +1,6 @@
 """The page's part for a pair of pictures: its form, and the tabs that show its depth."""
 
 import asyncio
-import shutil
 import tempfile
 from collections.abc import Sequence
 from functools import partial
@@ -10,7 +9,7 @@ from typing import Any
 
 import gradio as gr
 
-from stereoweave.app.events import LIFETIME_S, MATCHING, Cancelled, Host, scroll_to
+from stereoweave.app.events import MATCHING, Cancelled, Host, scroll_to
 from stereoweave.app.notices import (
     Wording,
     format_frame,
@@ -33,6 +32,7 @@ from stereoweave.app.session import (
     write_all,
     write_shown_report,
 )
+from stereoweave.app.session_store import SessionStore
 from stereoweave.app.stereo_picture_tab import StereoPictureTab
 from stereoweave.errors import Note, StereoweaveError
 from stereoweave.io.colormap import OCCLUDED_RGB, colour_confidence, css_colour, legend_colours
@@ -55,7 +55,13 @@ _TO_COMPARE = (
     "Click two points in the left picture to compare their disparities: what is nearer has a larger one. "
     "Distances in metres need a calibration file, or the focal length and the baseline."
 )
-_GONE = "This result has expired (results are kept for an hour). Find depth again."
+# A result takes 60 MB plus 19 bytes per pixel of the left picture in memory (0.5 GB at 24 megapixels), and
+# the size of its files on disk (0.9 GB at 24 megapixels).
+_MOST_SESSIONS = 4
+_GONE = (
+    "This result has expired: results are kept for an hour, and only the last four of all visitors. "
+    "Find depth again."
+)
 
 
 class PairTab:
@@ -67,7 +73,7 @@ class PairTab:
 
     def __init__(self, host: Host) -> None:
         self._host, self._wording = host, Wording(host.folder, label_of)
-        self._session = gr.State(None, time_to_live=LIFETIME_S, delete_callback=_remove_files)
+        self._sessions = SessionStore(_MOST_SESSIONS)
         self._clicks = gr.State([])
         with gr.Row():
             with gr.Column(scale=1, min_width=280):
@@ -86,7 +92,7 @@ class PairTab:
                 self._build_views()
             with gr.Tab("3-D picture") as self._picture_tab:
                 self._stereo = StereoPictureTab(
-                    self._host, self._wording, self.cancel, self._session, self._position
+                    self._host, self._wording, self.cancel, self._sessions, self._position
                 )
             with gr.Tab("Explore") as self._report_tab:
                 self._report = gr.HTML(elem_id="report", padding=False, min_height=200)
@@ -130,13 +136,13 @@ class PairTab:
         for begin in (form.find.click, sampled.then):
             found = begin(
                 self._find_depth,
-                {*form.fields, self._position, self._session},
+                {*form.fields, self._position, self._sessions.key},
                 [*taken, *self._shown_parts],
                 show_progress_on=self._status,
                 **MATCHING,
             )
             written = found.then(
-                self._write_files, self._session, taken, show_progress_on=self._files, **MATCHING
+                self._write_files, self._sessions.key, taken, show_progress_on=self._files, **MATCHING
             )
             scroll_to(self._status, [found.then])
             long += [found, written]
@@ -153,14 +159,14 @@ class PairTab:
         """
         self.cancel.switch_on([self._report_tab.select])
         return self._report_tab.select(
-            self._show_report, self._session, self._report, show_progress_on=self._report, **MATCHING
+            self._show_report, self._sessions.key, self._report, show_progress_on=self._report, **MATCHING
         )
 
     def _connect_views(self) -> None:
         """Connect the events of the results that are drawn at once."""
         self._position.input(
-            self._render_view,
-            [self._session, self._position],
+            self._move_view,
+            [self._sessions.key, self._position],
             [self._view, self._where],
             show_progress="hidden",
             trigger_mode="always_last",
@@ -169,7 +175,7 @@ class PairTab:
         )
         self._clickable.select(
             self._measure_click,
-            [self._session, self._clicks],
+            [self._sessions.key, self._clicks],
             [self._clickable, self._measured, self._clicks],
             show_progress="hidden",
             trigger_mode="multiple",
@@ -184,7 +190,7 @@ class PairTab:
     @property
     def _shown_parts(self) -> list[Any]:
         pictures = [self._view, self._where, self._depth, self._ramp, self._confidence, self._clickable]
-        parts = [self._results, self._session, self._clicks, self._measured, self._tabs, self._report]
+        parts = [self._results, self._sessions.key, self._clicks, self._measured, self._tabs, self._report]
         return [*pictures, *parts, *self._stereo.parts]
 
     async def _find_depth(
@@ -199,25 +205,28 @@ class PairTab:
             result = await self._host.work(request, partial(match_uploads, uploads), progress, self.cancel)
             progress(0.6, desc="showing")
             # Otherwise, all other visitors would wait.
-            shown = await asyncio.to_thread(self._open_result, result, given[self._position])
+            shown = await asyncio.to_thread(
+                self._open_result, result, given[self._position], given[self._sessions.key]
+            )
         except Cancelled:
             return {self._status: gr.skip()}
         except (StereoweaveError, OSError) as error:
-            shown = {
+            self._sessions.remove(given[self._sessions.key])
+            return {
                 self._status: self._wording.format_error(error),
                 self._results: gr.update(visible=False),
-                self._session: None,
+                self._sessions.key: None,
             }
-        _remove_files(given[self._session])
         return shown
 
     async def _write_files(
         self,
-        session: Session | None,
+        key: str | None,
         request: gr.Request,
         progress: Any = gr.Progress(),  # noqa: B008
     ) -> dict[Any, Any]:
         """Write the result's files. This takes as long as all previous steps together."""
+        session = self._sessions.find(key)
         if session is None:
             return {self._files: None}
         if session.is_written:  # a cancelled job is followed by this step, too
@@ -228,7 +237,11 @@ class PairTab:
         except Cancelled:
             return {self._status: gr.skip()}
         except (StereoweaveError, OSError) as error:
+            if not self._sessions.keeps(key, session):
+                return {self._status: gr.skip()}
             return {self._status: self._wording.format_error(error)}
+        if not self._sessions.keeps(key, session):  # the visitor has found another depth
+            return {self._status: gr.skip()}
         archive = written.archive
         return {
             self._status: self._format_summary(session, written.warnings, written.notes),
@@ -243,17 +256,15 @@ class PairTab:
             lines.insert(0, _ABOUT_REMEDIES if any("(“" in line for line in lines) else _ABOUT_NOTES)
         return banner + format_notice([*format_summary(session.result.summary), *lines])
 
-    def _open_result(self, result: Result, position: float) -> dict[Any, Any]:
-        folder = Path(tempfile.mkdtemp(dir=self._host.folder))
-        return self._show_result(open_session(result, folder), position)
-
-    def _show_result(self, session: Session, position: float) -> dict[Any, Any]:
+    def _open_result(self, result: Result, position: float, before: str | None) -> dict[Any, Any]:
+        """Keep a result instead of the one before, and return the page's new content."""
+        session = open_session(result, Path(tempfile.mkdtemp(dir=self._host.folder)))
         pair, estimate = session.pair, session.estimate
-        view, where = self._render_view(session, position)
+        view, where = _render_view(session, position)
         return {
             self._status: self._format_summary(session, find_early_warnings(session.result)),
             self._results: gr.update(visible=True),
-            self._session: session,
+            self._sessions.key: self._sessions.keep(session, before),
             self._view: view,
             self._where: where,
             self._depth: colour_depth(session),
@@ -269,21 +280,19 @@ class PairTab:
             **self._stereo.empty(),
         }
 
-    def _render_view(self, session: Session | None, position: float) -> tuple[Any, str]:
-        """Render the view from a position, and return the image and a one-line description."""
-        if session is None:
-            return gr.skip(), _GONE
-        view = session.renderer.view(position)
-        unseen = f"{100 * (~view.drawn).mean():.1f} % of it filled in, as neither camera saw it"
-        return view.image, f"{position:g}, {_describe_position(position)}; {unseen}"
+    def _move_view(self, key: str | None, position: float) -> tuple[Any, str]:
+        """Render the view from another position, and return the image and a one-line description."""
+        session = self._sessions.find(key)
+        return (gr.skip(), _GONE) if session is None else _render_view(session, position)
 
     async def _show_report(
         self,
-        session: Session | None,
+        key: str | None,
         request: gr.Request,
         progress: Any = gr.Progress(),  # noqa: B008
     ) -> str:
         """Write the report unless it is there, and return a frame that shows it, or an error."""
+        session = self._sessions.find(key)
         if session is None:
             return format_paragraphs([_GONE])
         file = session.shown_report
@@ -295,15 +304,18 @@ class PairTab:
                 return ""
             except (StereoweaveError, OSError) as error:
                 return self._wording.format_error(error)
+        if not self._sessions.keeps(key, session):
+            return ""
         try:
             return format_frame(file.read_text(encoding="utf-8"), title="Report")
         except OSError:  # it has expired meanwhile
             return format_paragraphs([_GONE])
 
     def _measure_click(
-        self, session: Session | None, clicks: list[tuple[int, int]], event: gr.SelectData
+        self, key: str | None, clicks: list[tuple[int, int]], event: gr.SelectData
     ) -> tuple[Any, str, list[tuple[int, int]]]:
         """Mark up to two clicked points in the left image, and describe their depths and their distance."""
+        session = self._sessions.find(key)
         if session is None:
             return gr.skip(), format_paragraphs([_GONE]), []
         column, row = event.index
@@ -315,10 +327,11 @@ class PairTab:
         )
 
 
-def _remove_files(session: Session | None) -> None:
-    """Remove the files of a result that is no longer shown."""
-    if session:
-        shutil.rmtree(session.folder, ignore_errors=True)
+def _render_view(session: Session, position: float) -> tuple[Any, str]:
+    """Render the view from a position, and return the image and a one-line description."""
+    view = session.renderer.view(position)
+    unseen = f"{100 * (~view.drawn).mean():.1f} % of it filled in, as neither camera saw it"
+    return view.image, f"{position:g}, {_describe_position(position)}; {unseen}"
 
 
 def _make_picture(label: str, name: str) -> gr.Image:

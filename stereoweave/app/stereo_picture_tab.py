@@ -10,6 +10,7 @@ import gradio as gr
 from stereoweave.app.events import AT_ONCE, MATCHING, CancelButton, Cancelled, Host
 from stereoweave.app.notices import Wording, format_frame, format_paragraphs
 from stereoweave.app.pair_form import LABELS
+from stereoweave.app.session_store import SessionStore
 from stereoweave.app.stereo_pictures import AUTOMATIC_PX, FULL_PX, KINDS, Wish, write_stereo_picture
 from stereoweave.errors import StereoweaveError
 
@@ -35,15 +36,15 @@ class StereoPictureTab:
         host: What the page's parts share.
         wording: The form's words.
         cancel: The form's button that cancels work.
-        session: The visitor's result.
+        sessions: The visitors' results.
         position: The viewpoint of the kind that shows one view.
     """
 
     def __init__(
-        self, host: Host, wording: Wording, cancel: CancelButton, session: gr.State, position: gr.Slider
+        self, host: Host, wording: Wording, cancel: CancelButton, sessions: SessionStore, position: gr.Slider
     ) -> None:
         self._host, self._wording, self._cancel = host, wording, cancel
-        self._session, self._position = session, position
+        self._sessions, self._position = sessions, position
         with gr.Row(equal_height=True):
             self._kind = gr.Dropdown(
                 [(kind.label, name) for name, kind in KINDS.items()],
@@ -90,7 +91,7 @@ class StereoPictureTab:
         """
         begins = [tab.select, self._kind.input, self._size.input, self._crops.input]
         self._cancel.switch_on(begins)
-        asked: set[Any] = {self._session, self._kind, self._size, self._crops, self._position}
+        asked: set[Any] = {self._sessions.key, self._kind, self._size, self._crops, self._position}
         self._kind.focus(None, None, None, js=_SHOW_CHOICE, api_visibility="private")
         self._kind.input(
             _describe,
@@ -117,7 +118,8 @@ class StereoPictureTab:
         progress: Any = gr.Progress(),  # noqa: B008
     ) -> dict[Any, Any]:
         """Write the picture unless it is there, and return how to look at it, its preview and its file."""
-        kind, session = given[self._kind], given[self._session]
+        kind, key = given[self._kind], given[self._sessions.key]
+        session = self._sessions.find(key)
         viewing = format_paragraphs([KINDS[kind].viewing])
         if session is None:
             return {self._viewing: viewing}
@@ -135,6 +137,8 @@ class StereoPictureTab:
                 return {self._viewing: viewing}
             except (StereoweaveError, OSError) as error:
                 return {self._viewing: self._wording.format_error(error), **self.empty()}
+            if not self._sessions.keeps(key, session):
+                return {self._viewing: viewing}
         made = session.stereo_pictures[wish]
         size_mb = made.file.stat().st_size / 1e6
         label = f"Download {made.file.name} ({size_mb:.1f} MB)"
