@@ -32,7 +32,7 @@ from stereoweave.app.notices import (
 from stereoweave.app.pair_form import MODELS, make_layout_choice, read_layout
 from stereoweave.app.still_frame import convert_still
 from stereoweave.app.video_outputs import OUTPUTS
-from stereoweave.app.video_upload import PREVIEW_S, ConvertedVideo, VideoUpload, convert_upload
+from stereoweave.app.video_upload import PREVIEW_S, ConvertedVideo, VideoUpload, convert_upload, keep_uploads
 from stereoweave.errors import StereoweaveError
 from stereoweave.matching.backend import Backend
 from stereoweave.video.packings import FRAME_PACKINGS
@@ -173,13 +173,15 @@ class VideoTab:
     ) -> AsyncGenerator[dict[Any, Any]]:
         folder = Path(tempfile.mkdtemp(dir=self._host.folder))
         newest, visitor = NewestFrame(folder), str(request.session_hash)
-        work = partial(convert_upload, self._read(given, start_s), folder)
+        upload = self._read(given, start_s)
+        work = partial(convert_upload, upload, folder)
         made: ConvertedVideo | None = None
         self._newest[visitor] = newest
         try:
             yield (shown := self._panel.begin(given[self._output]))
             async with self._host.start(request, work, self.cancel) as job:
                 while not await job.is_done():
+                    keep_uploads(upload.files)
                     said = {self._status: format_progress(job.share, job.what)}
                     before, shown = shown, said | self._show_newest(newest)
                     if shown != before:

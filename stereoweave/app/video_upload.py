@@ -1,8 +1,10 @@
 """Conversion of an uploaded stereo video, or of some seconds of it, without the user interface."""
 
 import io
+import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from math import inf
@@ -64,6 +66,13 @@ class ConvertedVideo:
     summary: str
     facts: list[str]
     warnings: list[str]
+
+
+def keep_uploads(files: Iterable[Path]) -> None:
+    """Keep uploads that are in use: the page removes files an hour after their last change."""
+    for file in files:
+        with suppress(FileNotFoundError):
+            os.utime(file)
 
 
 def convert_upload(upload: VideoUpload, folder: Path, report: Callable[[float, str], None]) -> ConvertedVideo:

@@ -1,6 +1,7 @@
 """Long work of the page in Chromium: visitors at once, cancelling, leaving, and 3-D pictures and videos."""
 
 import io
+import os
 import re
 import time
 from collections.abc import Iterator
@@ -23,7 +24,7 @@ from video_examples import example_pairs, packed, write_video
 
 from stereoweave.app.stereo_pictures import AUTOMATIC_PX, FULL_PX, KINDS, Wish, write_stereo_picture
 from stereoweave.app.video_tab import label_of
-from stereoweave.app.video_upload import VideoUpload, convert_upload
+from stereoweave.app.video_upload import VideoUpload, convert_upload, keep_uploads
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io.images import read_image, write_image
 from stereoweave.matching.backend import Backend
@@ -512,6 +513,15 @@ def test_a_video_s_frames_and_the_time_left_are_reported(tmp_path):
         r"4 frames of 160×96 px, 0.2 s.*The whole video takes about \d+ (s|min|h)\.", made.summary
     )
     assert made.warnings == []
+
+
+def test_uploads_in_use_do_not_age(tmp_path):
+    upload = tmp_path / "in.mp4"
+    upload.touch()
+    os.utime(upload, (0, 0))
+    keep_uploads([upload, tmp_path / "gone.mp4"])
+    assert time.time() - upload.stat().st_mtime < 60
+    assert not (tmp_path / "gone.mp4").exists()
 
 
 def test_a_spatial_video_is_converted_with_a_note(tmp_path):
