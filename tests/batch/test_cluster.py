@@ -125,6 +125,14 @@ def test_bad_pairs_become_rows_and_the_next_run_processes_missing_changed_and_ne
     assert not list((out / "begun").iterdir())
 
 
+def test_a_set_whose_names_tell_no_sides_says_what_they_are_taken_for(tmp_path):
+    for folder in ("image_2", "image_3"):
+        (tmp_path / "kitti" / folder).mkdir(parents=True)
+        (tmp_path / "kitti" / folder / "000000_10.png").touch()
+    (note,) = extend_plan(store_at(tmp_path / "kitti"), store_at(tmp_path / "out"), workers=1).notes
+    assert note.endswith("as 1_L.jpg and 1_R.jpg do, so each picture is taken to hold both views")
+
+
 def test_no_pair_is_lost_or_duplicated_when_workers_and_the_driver_are_killed(ray_address, engine, tmp_path):
     names = number_names(40)
     source, out = write_pairs(tmp_path / "pairs", names, (256, 192)), tmp_path / "out"
