@@ -180,9 +180,12 @@ def _render(
     from stereoweave.io.files import refuse_inputs
     from stereoweave.matching.estimate import match
     from stereoweave.outputs.sphere_views import write_whole_view
+    from stereoweave.rendering.renderer import check_convergence_px
     from stereoweave.system.compiling_ahead import compile_ahead
 
     pair = prepared.pair if whole else crop_to_content(prepared.pair)
+    if file.convergence_px is not None and not whole:
+        check_convergence_px(file.convergence_px, pair.left.shape[1])
     file = file.add_mark(pair)
     make_parent_folder(file.path)
     refuse_inputs([file.path], prepared.pictures)

@@ -20,6 +20,7 @@ from stereoweave.io.output_lock import lock_output
 from stereoweave.matching.edge_vote.vote import rehearse_voting
 from stereoweave.pictures.panoramas import NO_SPHERE
 from stereoweave.rendering.rehearsals import rehearse_drawing, rehearse_filling, rehearse_fine_drawing
+from stereoweave.rendering.renderer import check_convergence_px
 from stereoweave.stereo import StereoCamera
 from stereoweave.system.compiling_ahead import Rehearsal, compile_ahead
 from stereoweave.system.progress import progress
@@ -165,8 +166,10 @@ def fit_to_video(job: VideoJob, video: StereoVideo) -> VideoJob:
     """Return the job as it is for a calibrated video, or for what is shown of a VR180 or 360-degree video.
 
     Raises:
-        StereoweaveError: The whole cannot be shown as the job says.
+        StereoweaveError: The whole cannot be shown as the job says, or the convergence exceeds the width.
     """
+    if job.convergence_px is not None and not (video.sphere and video.sphere.is_whole):
+        check_convergence_px(job.convergence_px, video.size_px[0])
     if video.rig is not None:
         return replace(job, rectify=False)
     if video.sphere is None:

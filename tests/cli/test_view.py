@@ -199,6 +199,7 @@ def test_cropping_leaves_what_all_views_show(pair, arguments, width_px):
         ("--layout quilt --quilt 900x900 -o v.png", ["quilt", "2 to 200 views", "900x900"]),
         ("--convergence middle -o v.png", ["--convergence", "px, or auto", "'middle'"]),
         ("--convergence inf -o v.png", ["--convergence", "px, or auto", "'inf'"]),
+        ("--size 80 --convergence 999 -o v.png", ["--convergence", "(the picture's width), got 999"]),
         ("--layout rgbd -o taken.png", ["taken_RGBD.png", "expected a writable file", "found a folder"]),
     ],
 )

@@ -506,6 +506,11 @@ def test_a_damaged_frame_is_reported_with_its_time_and_does_not_end_the_video(tm
         ("out.mp4", ["--depth", "--model", "huge"], "unknown model 'huge'"),
         ("out.mp4", ["--depth", "--format", "diagonal"], "--format: expected one of side_by_side"),
         ("out.mp4", ["--position", "0", "--convergence", "nan"], "--convergence: expected a finite number"),
+        (
+            "out.mp4",
+            ["--layout", "side_by_side_half", "--convergence", "999"],
+            "(the picture's width), got 999",
+        ),
         ("out.mp4", ["--layout", "quilt", "--convergence", "-inf"], "expected a finite number, found -inf"),
         ("out.mp4", ["--position", "0.5", "--strength", "inf"], "--strength: expected a finite number"),
         ("out.mp4", ["--depth", "--convergence", "3"], "--convergence: expected a view or a layout of views"),
