@@ -61,8 +61,7 @@ def align(pair: StereoPair, *, always: bool = False, parallel: bool = False) -> 
 def align_rows(pair: StereoPair, *, parallel: bool = False, keep_screen: bool = False) -> Aligned:
     """Rectify a pair if its rows are apart, as `align` does, without swapping its sides.
 
-    With `keep_screen`, the median disparity stays, so that the same things are in front of the screen as in
-    the original pictures; the result has no camera.
+    For `keep_screen`, see `fit_warps`.
     """
     before = check_pair(pair.left, pair.right)
     as_it_is = Aligned(pair=pair, alignment=before)
@@ -79,9 +78,7 @@ def align_rows(pair: StereoPair, *, parallel: bool = False, keep_screen: bool = 
 
 
 def _rectify(pair: StereoPair, *, parallel: bool, keep_screen: bool = False) -> Aligned:
-    fit = fit_warps(pair, parallel=parallel)
-    if keep_screen:
-        fit = fit.keep_screen()
+    fit = fit_warps(pair, parallel=parallel, keep_screen=keep_screen)
     rectified = fit.apply(pair)
     alignment = check_pair(rectified.left, rectified.right)
     return Aligned(pair=rectified, alignment=alignment, notes=(fit.note,), warps=fit.warps)

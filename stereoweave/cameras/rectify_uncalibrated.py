@@ -3,6 +3,7 @@
 import math
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import cv2
@@ -68,13 +69,6 @@ class Fit:
         camera = self._warp_camera(pair.camera) if pair.camera and self.cameras.parallel else None
         return replace(apply_warps(pair, self.warps), camera=camera)
 
-    def keep_screen(self) -> "Fit":
-        """Return the fit whose right picture is moved sideways, so that the median disparity stays."""
-        aligned = self.warps.transform(self.matches)
-        nearer_px = float(np.median(aligned.disparity_px) - np.median(self.matches.disparity_px))
-        warps = Warps(self.warps.left, self.warps.right.shifted((nearer_px, 0.0)))
-        return replace(self, warps=warps, cameras=replace(self.cameras, parallel=False))
-
     def _warp_camera(self, camera: StereoCamera) -> StereoCamera:
         """Return the camera of the warped pair: turns keep a camera, but scaling and moving change it."""
         turned = self.cameras.make_warps().left.homography
@@ -125,9 +119,11 @@ def apply_warps(pair: StereoPair, warps: Warps) -> StereoPair:
     return replace(pair, left=left, right=right, camera=None, left_seen=left_seen, right_seen=right_seen)
 
 
-def fit_warps(pair: StereoPair, *, parallel: bool = False) -> Fit:
+def fit_warps(pair: StereoPair, *, parallel: bool = False, keep_screen: bool = False) -> Fit:
     """Fit the warps of `rectify_by_features`; raises the same errors.
 
+    With `keep_screen`, for a pair without a camera, the right picture is moved so that the median disparity
+    stays, scaled as the pictures are: the same things are then in front of the screen as before.
     With `parallel`, the maker of the pair's camera states parallel axes and no distortion: rows are then only
     bent, which keeps the disparities, unless this leaves them too far apart.
     """
@@ -148,7 +144,8 @@ def fit_warps(pair: StereoPair, *, parallel: bool = False) -> Fit:
             cameras = _fit_closely(cameras, found, scale)
             if abs(np.degrees(cameras.toe_in)) < _MOST_TOE_IN_DEGREES:
                 return _finish(replace(cameras, parallel=True), found, scale)
-    return _finish(_fit_closely(fit_cameras(first, (width, height)), found, scale), found, scale)
+    cameras = _fit_closely(fit_cameras(first, (width, height)), found, scale)
+    return _finish(cameras, found, scale, keep_screen=keep_screen)
 
 
 def _fit_closely(cameras: CameraFit, found: Matches, scale: float) -> CameraFit:
@@ -158,11 +155,12 @@ def _fit_closely(cameras: CameraFit, found: Matches, scale: float) -> CameraFit:
     return cameras
 
 
-def _finish(cameras: CameraFit, found: Matches, scale: float) -> Fit:
+def _finish(cameras: CameraFit, found: Matches, scale: float, *, keep_screen: bool = False) -> Fit:
     if cameras.parallel:
         cameras = _fit_again(cameras, found, scale * _SELECTIONS_PX[-1])
-    smooth = _bend_rows(_place(cameras, found, scale), found, scale)
-    chosen = smooth or _place(_fit_again(cameras, found, scale * _RIGHT_PX), found, scale)
+    place = partial(_place, found=found, scale=scale, keep_screen=keep_screen)
+    smooth = _bend_rows(place(cameras), found, scale)
+    chosen = smooth or place(_fit_again(cameras, found, scale * _RIGHT_PX))
     return _make_fit(chosen, found, scale)
 
 
@@ -208,11 +206,11 @@ def _require_enough(found: Matches, right_ones: Bool[np.ndarray, " n"]) -> Match
     return found.select(right_ones)
 
 
-def _place(cameras: CameraFit, found: Matches, scale: float) -> _Candidate:
+def _place(cameras: CameraFit, found: Matches, scale: float, *, keep_screen: bool) -> _Candidate:
     """Return the cameras' warps, moved and scaled so that little of the pictures is lost.
 
-    The left picture stays centred. The right one is shifted to the left if disparities would be negative,
-    unless they give metric depth.
+    The left picture stays centred. The right one is shifted so that the median disparity stays with
+    `keep_screen`; otherwise to the left if disparities would be negative, unless they give metric depth.
     """
     warps = cameras.make_warps()
     matches = _require_enough(found, np.abs(cameras.measure_sampson_px(found)) < scale * _SELECTIONS_PX[-1])
@@ -223,8 +221,11 @@ def _place(cameras: CameraFit, found: Matches, scale: float) -> _Candidate:
     warps = Warps(*(warp.scaled(zoom) for warp in warps))
     if cameras.parallel:
         return _Candidate(cameras, warps)
-    least_px = np.percentile(warps.transform(matches).disparity_px, _OUTER_PERCENT)
-    moved_px = float(np.floor(min(least_px, 0.0)))
+    aligned_px = warps.transform(matches).disparity_px
+    if keep_screen:
+        moved_px = float(np.median(aligned_px) - zoom * np.median(matches.disparity_px))
+    else:
+        moved_px = float(np.floor(min(np.percentile(aligned_px, _OUTER_PERCENT), 0.0)))
     return _Candidate(cameras, Warps(warps.left, warps.right.shifted((moved_px, 0.0))))
 
 

@@ -44,14 +44,21 @@ def test_a_shot_keeps_its_rectification_until_the_next_one_begins(shots):
     assert is_rectified(aligner(shots[1]))
 
 
-def test_a_rectified_shot_keeps_its_depth_about_the_screen(shots):
-    converged = StereoPair(left=shots[0].left, right=np.roll(shots[0].right, 30, axis=1))
-    before, after = (
-        np.median(find_matches(pair.left, pair.right).disparity_px)
-        for pair in (converged, ShotAligner()(converged))
+@pytest.mark.parametrize("sway_px", [0, 4])
+def test_a_rectified_shot_keeps_its_depth_about_the_screen(shots, sway_px):
+    pair = shots[0]
+    if sway_px:
+        pair = take(painted(2), turn(SIZE, (0, 0, 0)), rolling_shutter(SIZE, sway_px)).pair
+    converged = StereoPair(left=pair.left, right=np.roll(pair.right, 30, axis=1))
+    aligner = ShotAligner()
+    aligned = aligner(converged)
+    assert ("right_field_px" in aligner.state()) == (sway_px > 0)
+    before_px, after_px = (
+        np.median(find_matches(pair.left, pair.right).disparity_px) for pair in (converged, aligned)
     )
-    assert before < -10
-    assert after == pytest.approx(before, abs=1)
+    assert before_px < -10
+    assert after_px == pytest.approx(before_px, abs=1.5)
+    assert is_rectified(aligned)
 
 
 def test_a_shot_that_begins_plain_is_measured_at_its_first_frame_with_content(shots):
