@@ -4,7 +4,7 @@ import os
 import tempfile
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from stereoweave.errors import Remedy, StereoweaveError
@@ -41,21 +41,23 @@ def replacing_together(
         fresh = [name for name in names if Path(folder, name).exists()]
         now_ns = time.time_ns()
         for name in fresh:
-            os.utime(Path(folder, name), ns=(now_ns, now_ns))
+            with suppress(PermissionError):  # of a mounted disk whose files belong to another user
+                os.utime(Path(folder, name), ns=(now_ns, now_ns))
         # Without the lock, two commands could leave a mixture of their files.
         with lock_output(make_folder(out)):
-            # The marks are replaced first, and no other old file stays until then, so that a result is
-            # recognised even if this process is killed in between.
-            kept = {name for name in fresh if name in marks or not marks}
-            for name in find_result(out, names, marks) - kept:
-                (out / name).unlink()
-            for name in sorted(fresh, key=lambda name: name not in marks):
+            earlier = find_result(out, names, marks)
+            for name in fresh:
                 Path(folder, name).replace(out / name)
+            for name in earlier.difference(fresh):
+                (out / name).unlink(missing_ok=True)
 
 
 def find_result(out: Path, names: Sequence[str], marks: Sequence[str]) -> set[str]:
     """Return the files of the result in a folder; see `replacing_together`."""
-    changed_ns = {name: (out / name).stat().st_mtime_ns for name in names if (out / name).exists()}
+    changed_ns = {}
+    for name in names:
+        with suppress(FileNotFoundError):
+            changed_ns[name] = (out / name).stat().st_mtime_ns
     if not marks:
         return {*changed_ns}
     found = {name for name, at_ns in changed_ns.items() if at_ns == changed_ns.get(marks[0])}
