@@ -32,7 +32,7 @@ from stereoweave.app.session import (
     write_all,
     write_shown_report,
 )
-from stereoweave.app.session_store import SessionStore
+from stereoweave.app.session_store import GONE, SessionStore
 from stereoweave.app.stereo_picture_tab import StereoPictureTab
 from stereoweave.errors import Note, StereoweaveError
 from stereoweave.io.colormap import OCCLUDED_RGB, colour_confidence, css_colour, legend_colours
@@ -58,14 +58,10 @@ _TO_COMPARE = (
 # A result takes 60 MB plus 19 bytes per pixel of the left picture in memory (0.5 GB at 24 megapixels), and
 # the size of its files on disk (0.9 GB at 24 megapixels).
 _MOST_SESSIONS = 4
-_GONE = (
-    "This result has expired: results are kept for an hour, and only the last four of all visitors. "
-    "Find depth again."
-)
 
 
 class PairTab:
-    """Components and event handlers for a pair; the files to download are kept for an hour.
+    """Components and event handlers for a pair; `SessionStore` keeps the results.
 
     Attributes:
         cancel: The form's button that cancels work.
@@ -205,9 +201,7 @@ class PairTab:
             result = await self._host.work(request, partial(match_uploads, uploads), progress, self.cancel)
             progress(0.6, desc="showing")
             # Otherwise, all other visitors would wait.
-            shown = await asyncio.to_thread(
-                self._open_result, result, given[self._position], given[self._sessions.key]
-            )
+            session, shown = await asyncio.to_thread(self._open_result, result, given[self._position])
         except Cancelled:
             return {self._status: gr.skip()}
         except (StereoweaveError, OSError) as error:
@@ -217,7 +211,8 @@ class PairTab:
                 self._results: gr.update(visible=False),
                 self._sessions.key: None,
             }
-        return shown
+        # Not in the thread, which goes on if the visitor cancels meanwhile.
+        return {**shown, self._sessions.key: self._sessions.keep(session, given[self._sessions.key])}
 
     async def _write_files(
         self,
@@ -256,15 +251,14 @@ class PairTab:
             lines.insert(0, _ABOUT_REMEDIES if any("(“" in line for line in lines) else _ABOUT_NOTES)
         return banner + format_notice([*format_summary(session.result.summary), *lines])
 
-    def _open_result(self, result: Result, position: float, before: str | None) -> dict[Any, Any]:
-        """Keep a result instead of the one before, and return the page's new content."""
+    def _open_result(self, result: Result, position: float) -> tuple[Session, dict[Any, Any]]:
+        """Return the session of a result, and the page's new content but for the session's key."""
         session = open_session(result, Path(tempfile.mkdtemp(dir=self._host.folder)))
         pair, estimate = session.pair, session.estimate
         view, where = _render_view(session, position)
-        return {
+        return session, {
             self._status: self._format_summary(session, find_early_warnings(session.result)),
             self._results: gr.update(visible=True),
-            self._sessions.key: self._sessions.keep(session, before),
             self._view: view,
             self._where: where,
             self._depth: colour_depth(session),
@@ -283,7 +277,7 @@ class PairTab:
     def _move_view(self, key: str | None, position: float) -> tuple[Any, str]:
         """Render the view from another position, and return the image and a one-line description."""
         session = self._sessions.find(key)
-        return (gr.skip(), _GONE) if session is None else _render_view(session, position)
+        return (gr.skip(), GONE) if session is None else _render_view(session, position)
 
     async def _show_report(
         self,
@@ -294,7 +288,7 @@ class PairTab:
         """Write the report unless it is there, and return a frame that shows it, or an error."""
         session = self._sessions.find(key)
         if session is None:
-            return format_paragraphs([_GONE])
+            return format_paragraphs([GONE])
         file = session.shown_report
         if not file.exists():
             work = partial(write_shown_report, session.result, file)
@@ -303,13 +297,14 @@ class PairTab:
             except Cancelled:
                 return ""
             except (StereoweaveError, OSError) as error:
-                return self._wording.format_error(error)
+                if self._sessions.keeps(key, session):
+                    return self._wording.format_error(error)
         if not self._sessions.keeps(key, session):
-            return ""
+            return format_paragraphs([GONE])
         try:
             return format_frame(file.read_text(encoding="utf-8"), title="Report")
         except OSError:  # it has expired meanwhile
-            return format_paragraphs([_GONE])
+            return format_paragraphs([GONE])
 
     def _measure_click(
         self, key: str | None, clicks: list[tuple[int, int]], event: gr.SelectData
@@ -317,7 +312,7 @@ class PairTab:
         """Mark up to two clicked points in the left image, and describe their depths and their distance."""
         session = self._sessions.find(key)
         if session is None:
-            return gr.skip(), format_paragraphs([_GONE]), []
+            return gr.skip(), format_paragraphs([GONE]), []
         column, row = event.index
         clicks = [*(clicks if len(clicks) < 2 else []), (int(column), int(row))]
         return (

@@ -10,6 +10,11 @@ import gradio as gr
 from stereoweave.app.events import LIFETIME_S
 from stereoweave.app.session import Session
 
+GONE = (
+    "This result has expired: results are kept for an hour, and only the last four of all visitors. "
+    "Find depth again."
+)
+
 
 class SessionStore:
     """The visitors' latest results; of more than `most`, the one that was used longest ago is removed.

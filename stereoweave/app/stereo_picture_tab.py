@@ -10,7 +10,7 @@ import gradio as gr
 from stereoweave.app.events import AT_ONCE, MATCHING, CancelButton, Cancelled, Host
 from stereoweave.app.notices import Wording, format_frame, format_paragraphs
 from stereoweave.app.pair_form import LABELS
-from stereoweave.app.session_store import SessionStore
+from stereoweave.app.session_store import GONE, SessionStore
 from stereoweave.app.stereo_pictures import AUTOMATIC_PX, FULL_PX, KINDS, Wish, write_stereo_picture
 from stereoweave.errors import StereoweaveError
 
@@ -122,7 +122,7 @@ class StereoPictureTab:
         session = self._sessions.find(key)
         viewing = format_paragraphs([KINDS[kind].viewing])
         if session is None:
-            return {self._viewing: viewing}
+            return {self._viewing: format_paragraphs([GONE] if key else [KINDS[kind].viewing])}
         wish = Wish(
             kind=kind,
             longer_side_px=given[self._size],
@@ -136,9 +136,10 @@ class StereoPictureTab:
             except Cancelled:
                 return {self._viewing: viewing}
             except (StereoweaveError, OSError) as error:
-                return {self._viewing: self._wording.format_error(error), **self.empty()}
+                if self._sessions.keeps(key, session):
+                    return {self._viewing: self._wording.format_error(error), **self.empty()}
             if not self._sessions.keeps(key, session):
-                return {self._viewing: viewing}
+                return {self._viewing: format_paragraphs([GONE])}
         made = session.stereo_pictures[wish]
         size_mb = made.file.stat().st_size / 1e6
         label = f"Download {made.file.name} ({size_mb:.1f} MB)"
