@@ -15,6 +15,7 @@ from stereoweave.app.apart_capture import ApartCapture
 from stereoweave.errors import FormatError, Note, StereoweaveError
 from stereoweave.pictures.pair_layouts import Picture
 from stereoweave.stereo import StereoCamera
+from stereoweave.video.streams import refuse_playlist
 from stereoweave.video.tracks import read_declared_packing
 
 _DEFAULT_RATE = 25.0
@@ -183,6 +184,8 @@ def _measure_rate(capture: _Source) -> float:
 
 
 def _open_source(source: str, format: str | None) -> _Source:
+    if Path(source).is_file():
+        refuse_playlist(Path(source))
     if apart := ApartCapture.open(source, format):
         return apart
     level = cv2.utils.logging.getLogLevel()

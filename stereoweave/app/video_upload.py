@@ -69,7 +69,10 @@ class ConvertedVideo:
 
 
 def keep_uploads(files: Iterable[Path]) -> None:
-    """Keep uploads that are in use: the page removes files an hour after their last change."""
+    """Keep uploads that are in use: the page removes files an hour after their last change.
+
+    On Windows, an hour after their creation, which nothing changes.
+    """
     for file in files:
         with suppress(FileNotFoundError):
             os.utime(file)
@@ -147,7 +150,7 @@ def _check_upload(upload: VideoUpload) -> None:
 def _check_container(file: Path) -> None:
     """Raise FormatError unless a video holds its own content.
 
-    Playlists and the like name other files, which FFmpeg would read wherever they lie on the disk.
+    `open_container` accepts more: all containers but playlists and the like.
     """
     with require_video_extra("a video"):
         import av

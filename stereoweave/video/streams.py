@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from stereoweave.errors import FormatError, require_extra
+from stereoweave.io.files import reading
 from stereoweave.io.unreadable import check_readable
 
 if TYPE_CHECKING:
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
 # Type of the first box in an MP4 or MOV file, which follows the four bytes of the box's length.
 _MP4_BOXES = b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot"
 
-# Formats of files that name others, which FFmpeg would read wherever they lie, and how two of them begin.
+# Formats of files that name others, which FFmpeg would read wherever they lie, and how the usual ones begin.
 _REFERRING = {"hls", "dash", "concat", "imf"}
 _PLAYLISTS = b"#EXTM3U", b"ffconcat"
 
@@ -64,6 +65,7 @@ def list_video_streams(path: Path) -> list[StreamFacts]:
 def open_container(path: Path) -> "av.container.InputContainer":
     """Open a video file. Raises FormatError."""
     check_readable(path, "a video")
+    refuse_playlist(path)
     with require_extra("video", f"{path}: reading video needs PyAV"):
         import av
     own_content = ",".join(sorted(av.formats_available - _REFERRING))
@@ -71,6 +73,16 @@ def open_container(path: Path) -> "av.container.InputContainer":
         return av.open(str(path), metadata_errors="replace", options={"format_whitelist": own_content})
     except av.error.FFmpegError as error:
         raise FormatError(f"{path}: expected a video, found {_describe_unopened(path, error)}") from error
+
+
+def refuse_playlist(path: Path) -> None:
+    """Raise FormatError if a file is a playlist, or is unreadable."""
+    with reading(path, "a video"), path.open("rb") as file:
+        beginning = file.read(max(map(len, _PLAYLISTS)))
+    if beginning.startswith(_PLAYLISTS):
+        raise FormatError(
+            f"{path}: expected a video, found a playlist, which names other files; give the video itself"
+        )
 
 
 @contextmanager
@@ -133,8 +145,6 @@ def _describe_unopened(path: Path, error: "av.error.FFmpegError") -> str:
         beginning = file.read(8)
         if not beginning:
             return "an empty file"
-    if beginning.startswith(_PLAYLISTS):
-        return "a playlist, which names other files; give the video itself"
     found = f"none that FFmpeg can open ({describe_error(error)})"
     if beginning[4:] in _MP4_BOXES:
         found += "; if the file was cut off, its index is lost: record or download it again"

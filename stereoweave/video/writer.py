@@ -281,7 +281,7 @@ def check_container(path: Path, sound: Path | None) -> None:
         )
     if sound is None or _can_hold(path.suffix, sound):
         return
-    with av.open(str(sound)) as source:
+    with open_container(sound) as source:
         codecs = ", ".join(sorted({stream.codec_context.name for stream in source.streams.audio}))
     others = [ending for ending in CONTAINERS if _can_hold(ending, sound)]
     remedy = f"use {others[0]} instead" if others else "convert the sound first, for example to FLAC"
@@ -294,7 +294,7 @@ def _can_hold(ending: str, sound: Path) -> bool:
     """Return whether a container with this extension can hold a file's sound, as tested by muxing."""
     container = CONTAINERS[ending.lower()]
     try:
-        with av.open(str(sound)) as source, av.open(BytesIO(), "w", format=container) as output:
+        with open_container(sound) as source, av.open(BytesIO(), "w", format=container) as output:
             output.mux(list(islice(_read_sound(source, _copy_sound_streams(source, output)), _TRIED_PACKETS)))
     except ValueError:  # raised by both PyAV and FFmpeg for sound that the container cannot hold
         return False

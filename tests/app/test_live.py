@@ -155,6 +155,13 @@ def test_an_invalid_source_is_named_with_what_was_expected(source, found):
         Capture([source])
 
 
+def test_a_playlist_does_not_read_the_files_that_it_names(tmp_path):
+    playlist = tmp_path / "a.m3u8"
+    playlist.write_text("#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\n/other/secret.ts\n")
+    with pytest.raises(FormatError, match=r"a\.m3u8: expected a video, found a playlist, which names"):
+        Capture([str(playlist)])
+
+
 def test_more_than_two_sources_are_refused():
     with pytest.raises(StereoweaveError, match="found 3: 0 1 2"):
         Capture(["0", "1", "2"])
