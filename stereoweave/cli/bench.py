@@ -31,6 +31,7 @@ from stereoweave.cli.tables import (
     print_means,
     write_and_print,
 )
+from stereoweave.errors import StereoweaveError
 
 # Suffix of a network's name if its estimates are refined.
 REFINED = " refined"
@@ -317,6 +318,8 @@ def training(
     with require_train_extra():
         from stereoweave.learn.recipe import read_recipe
         from stereoweave.learn.training.curves import record_curve, record_network
+    if pairs is not None and recipe is None:
+        raise StereoweaveError("--pairs: expected only with --recipe, found without it")
     if recipe is not None:
         pairs = pairs or run.parent / "pairs"
         for name, score in record_network(run, read_recipe(recipe), pairs, out, Console()).items():

@@ -144,3 +144,5 @@ def test_a_checkpoint_has_the_scores_of_its_network_and_the_pairs_of_its_recipe(
     assert main(line) == 2
     message = f"{network}: expected a recipe for a network, found none"
     assert message in capsys.readouterr().err
+    assert main([*line, "--pairs", "collages"]) == 2
+    assert "--pairs: expected only with --recipe" in capsys.readouterr().err
