@@ -76,7 +76,7 @@ class ReplicaProcesses:
 
         Raises:
             StereoweaveError: If `check_pixels` raises an error, or the process crashes.
-            TimeoutError: If this takes longer than `left_s`.
+            TimeoutError: If this takes longer than `left_s`, or if the process is still starting.
         """
         try:
             return self._measurer(job, min(left_s, _MEASURING_LIMIT_S))

@@ -196,7 +196,7 @@ class StereoVideo:
             )
         part = copy.copy(self)
         part._first = self._first + first
-        part.frame_count = min(self._count_frames(length_s), self.frame_count - first)
+        part.frame_count = min(max(1, self._count_frames(length_s)), self.frame_count - first)
         part.excerpted = f"{part._first}+{part.frame_count}"
         part.sound = None
         return part

@@ -1,9 +1,11 @@
 import signal
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
+import psutil
 import pytest
 
 from stereoweave.errors import FormatError, MatcherError
@@ -93,6 +95,19 @@ def test_pictures_are_measured_from_their_headers(processes, tmp_path):
 def test_a_picture_whose_header_cannot_be_read_in_time_is_refused(processes):
     with pytest.raises(TimeoutError):
         processes.measure(make_job().job, left_s=0)
+
+
+def test_a_picture_that_cannot_be_measured_in_time_is_blamed(processes, monkeypatch):
+    processes.measure(make_job().job, left_s=60)  # wait for the start
+    monkeypatch.setattr(replica_processes, "_MEASURING_LIMIT_S", 0.3)
+    children = psutil.Process().children()
+    for child in children:
+        child.suspend()
+    with pytest.raises(FormatError, match="could not be read within 0.3 s; save the pictures again"):
+        processes.measure(make_job().job, left_s=60)
+    for child in children:
+        with suppress(psutil.NoSuchProcess):  # the one that measured was replaced
+            child.resume()
 
 
 def test_a_picture_is_not_blamed_for_a_process_that_is_still_starting(tmp_path, monkeypatch):

@@ -538,6 +538,7 @@ def test_an_excerpt_begins_at_the_frame_of_a_time_that_no_float_has(tmp_path):
     video = open_video([write_side_by_side(tmp_path / "video.mkv", flat_pairs(56))], "side_by_side")
     assert 2.2 * 25 > 55
     assert video.excerpt(2.2, 0.04).excerpted == "55+1"
+    assert video.excerpt(0, 1e-8).frame_count == 1
 
 
 def test_an_excerpt_ends_with_its_video(tmp_path):
