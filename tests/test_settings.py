@@ -29,6 +29,7 @@ VARIABLE: dict[tuple[str, str], set[str]] = {
     ("cameras/spherical.py", "setting"): {"look_deg", "fov_deg"},
     ("app/pair_form.py", "setting"): {"focal_px", "baseline_m"},
     ("errors.py", "error.setting"): set(),  # of an error that another one takes the place of
+    ("io/files.py", "setting"): {"out", "timeline"},
     ("outputs/sphere_views.py", "setting"): {"up", "forward", "size_px", "crop"},
     ("pictures/pair_finding.py", "side"): {"left", "right"},
     ("rendering/renderer.py", "name"): {"up", "forward"},

@@ -9,7 +9,7 @@ from typing import Any
 
 import gradio as gr
 
-from stereoweave.app.events import MATCHING, Cancelled, Host, scroll_to
+from stereoweave.app.events import LIFETIME_S, MATCHING, Cancelled, Host, scroll_to
 from stereoweave.app.notices import (
     Wording,
     format_frame,
@@ -70,6 +70,7 @@ class PairTab:
     def __init__(self, host: Host) -> None:
         self._host, self._wording = host, Wording(host.folder, label_of)
         self._sessions = SessionStore(_MOST_SESSIONS)
+        self._key = gr.State(None, time_to_live=LIFETIME_S, delete_callback=self._sessions.remove)
         self._clicks = gr.State([])
         with gr.Row():
             with gr.Column(scale=1, min_width=280):
@@ -88,7 +89,7 @@ class PairTab:
                 self._build_views()
             with gr.Tab("3-D picture") as self._picture_tab:
                 self._stereo = StereoPictureTab(
-                    self._host, self._wording, self.cancel, self._sessions, self._position
+                    self._host, self.cancel, self._sessions, self._key, self._position
                 )
             with gr.Tab("Explore") as self._report_tab:
                 self._report = gr.HTML(elem_id="report", padding=False, min_height=200)
@@ -132,13 +133,13 @@ class PairTab:
         for begin in (form.find.click, sampled.then):
             found = begin(
                 self._find_depth,
-                {*form.fields, self._position, self._sessions.key},
+                {*form.fields, self._position, self._key},
                 [*taken, *self._shown_parts],
                 show_progress_on=self._status,
                 **MATCHING,
             )
             written = found.then(
-                self._write_files, self._sessions.key, taken, show_progress_on=self._files, **MATCHING
+                self._write_files, self._key, taken, show_progress_on=self._files, **MATCHING
             )
             scroll_to(self._status, [found.then])
             long += [found, written]
@@ -155,14 +156,14 @@ class PairTab:
         """
         self.cancel.switch_on([self._report_tab.select])
         return self._report_tab.select(
-            self._show_report, self._sessions.key, self._report, show_progress_on=self._report, **MATCHING
+            self._show_report, self._key, self._report, show_progress_on=self._report, **MATCHING
         )
 
     def _connect_views(self) -> None:
         """Connect the events of the results that are drawn at once."""
         self._position.input(
             self._move_view,
-            [self._sessions.key, self._position],
+            [self._key, self._position],
             [self._view, self._where],
             show_progress="hidden",
             trigger_mode="always_last",
@@ -171,7 +172,7 @@ class PairTab:
         )
         self._clickable.select(
             self._measure_click,
-            [self._sessions.key, self._clicks],
+            [self._key, self._clicks],
             [self._clickable, self._measured, self._clicks],
             show_progress="hidden",
             trigger_mode="multiple",
@@ -186,7 +187,7 @@ class PairTab:
     @property
     def _shown_parts(self) -> list[Any]:
         pictures = [self._view, self._where, self._depth, self._ramp, self._confidence, self._clickable]
-        parts = [self._results, self._sessions.key, self._clicks, self._measured, self._tabs, self._report]
+        parts = [self._results, self._key, self._clicks, self._measured, self._tabs, self._report]
         return [*pictures, *parts, *self._stereo.parts]
 
     async def _find_depth(
@@ -205,14 +206,14 @@ class PairTab:
         except Cancelled:
             return {self._status: gr.skip()}
         except (StereoweaveError, OSError) as error:
-            self._sessions.remove(given[self._sessions.key])
+            self._sessions.remove(given[self._key])
             return {
                 self._status: self._wording.format_error(error),
                 self._results: gr.update(visible=False),
-                self._sessions.key: None,
+                self._key: None,
             }
         # Not in the thread, which goes on if the visitor cancels meanwhile.
-        return {**shown, self._sessions.key: self._sessions.keep(session, given[self._sessions.key])}
+        return {**shown, self._key: self._sessions.keep(session, given[self._key])}
 
     async def _write_files(
         self,

@@ -5,9 +5,6 @@ from collections import OrderedDict
 from threading import Lock
 from uuid import uuid4
 
-import gradio as gr
-
-from stereoweave.app.events import LIFETIME_S
 from stereoweave.app.session import Session
 
 GONE = (
@@ -20,16 +17,12 @@ class SessionStore:
     """The visitors' latest results; of more than `most`, the one that was used longest ago is removed.
 
     Gradio's own limit counts all windows, also those without a result, and leaves the files of a result.
-
-    Attributes:
-        key: Gradio's component that holds the key of the visitor's result.
     """
 
     def __init__(self, most: int) -> None:
         self._most = most
         self._sessions: OrderedDict[str, Session] = OrderedDict()
         self._lock = Lock()
-        self.key = gr.State(None, time_to_live=LIFETIME_S, delete_callback=self.remove)
 
     def keep(self, session: Session, instead_of: str | None) -> str:
         """Keep a result instead of the visitor's earlier one, and return the key by which it is found."""

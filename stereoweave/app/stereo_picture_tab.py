@@ -9,7 +9,7 @@ import gradio as gr
 
 from stereoweave.app.events import AT_ONCE, MATCHING, CancelButton, Cancelled, Host
 from stereoweave.app.notices import Wording, format_frame, format_paragraphs
-from stereoweave.app.pair_form import LABELS
+from stereoweave.app.pair_form import LABELS, label_of
 from stereoweave.app.session_store import GONE, SessionStore
 from stereoweave.app.stereo_pictures import AUTOMATIC_PX, FULL_PX, KINDS, Wish, write_stereo_picture
 from stereoweave.errors import StereoweaveError
@@ -34,17 +34,17 @@ class StereoPictureTab:
 
     Args:
         host: What the page's parts share.
-        wording: The form's words.
         cancel: The form's button that cancels work.
         sessions: The visitors' results.
+        key: The key of the visitor's result.
         position: The viewpoint of the kind that shows one view.
     """
 
     def __init__(
-        self, host: Host, wording: Wording, cancel: CancelButton, sessions: SessionStore, position: gr.Slider
+        self, host: Host, cancel: CancelButton, sessions: SessionStore, key: gr.State, position: gr.Slider
     ) -> None:
-        self._host, self._wording, self._cancel = host, wording, cancel
-        self._sessions, self._position = sessions, position
+        self._host, self._wording, self._cancel = host, Wording(host.folder, label_of), cancel
+        self._sessions, self._key, self._position = sessions, key, position
         with gr.Row(equal_height=True):
             self._kind = gr.Dropdown(
                 [(kind.label, name) for name, kind in KINDS.items()],
@@ -91,7 +91,7 @@ class StereoPictureTab:
         """
         begins = [tab.select, self._kind.input, self._size.input, self._crops.input]
         self._cancel.switch_on(begins)
-        asked: set[Any] = {self._sessions.key, self._kind, self._size, self._crops, self._position}
+        asked: set[Any] = {self._key, self._kind, self._size, self._crops, self._position}
         self._kind.focus(None, None, None, js=_SHOW_CHOICE, api_visibility="private")
         self._kind.input(
             _describe,
@@ -118,7 +118,7 @@ class StereoPictureTab:
         progress: Any = gr.Progress(),  # noqa: B008
     ) -> dict[Any, Any]:
         """Write the picture unless it is there, and return how to look at it, its preview and its file."""
-        kind, key = given[self._kind], given[self._sessions.key]
+        kind, key = given[self._kind], given[self._key]
         session = self._sessions.find(key)
         viewing = format_paragraphs([KINDS[kind].viewing])
         if session is None:
