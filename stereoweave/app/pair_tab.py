@@ -233,17 +233,16 @@ class PairTab:
         except Cancelled:
             return {self._status: gr.skip()}
         except (StereoweaveError, OSError) as error:
-            if not self._sessions.keeps(key, session):
-                return {self._status: gr.skip()}
-            return {self._status: self._wording.format_error(error)}
-        if not self._sessions.keeps(key, session):  # the visitor has found another depth
-            return {self._status: gr.skip()}
-        archive = written.archive
-        return {
-            self._status: self._format_summary(session, written.warnings, written.notes),
-            self._files: [str(file) for file in written.files],
-            self._all: gr.update(value=archive and str(archive), visible=archive is not None),
-        }
+            shown = {self._status: self._wording.format_error(error)}
+        else:
+            archive = written.archive
+            shown = {
+                self._status: self._format_summary(session, written.warnings, written.notes),
+                self._files: [str(file) for file in written.files],
+                self._all: gr.update(value=archive and str(archive), visible=archive is not None),
+            }
+        # Otherwise, the visitor has found another depth meanwhile.
+        return shown if self._sessions.keeps(key, session) else {self._status: gr.skip()}
 
     def _format_summary(self, session: Session, warnings: Sequence[Note], notes: Sequence[Note] = ()) -> str:
         banner = format_warnings(self._wording.format_notes(warnings))
