@@ -74,7 +74,7 @@ HeldOutPairs = Annotated[
     typer.Option(
         "--pairs",
         metavar="FOLDER",
-        help="Folder of the held-out pairs; missing ones are created (default: pairs, beside the first run).",
+        help="Folder of the held-out pairs; missing ones are created (default: pairs, beside RUN).",
     ),
 ]
 Models = Annotated[
