@@ -233,7 +233,7 @@ class PairTab:
         except Cancelled:
             return {self._status: gr.skip()}
         except (StereoweaveError, OSError) as error:
-            shown = {self._status: self._wording.format_error(error)}
+            shown: dict[Any, Any] = {self._status: self._wording.format_error(error)}
         else:
             archive = written.archive
             shown = {
