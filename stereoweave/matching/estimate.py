@@ -35,6 +35,8 @@ from stereoweave.system.steps import step
 _CONFIDENT, _CONFIDENT_AT_END = 0.5, 0.9
 # The disparity range is searched if at least this percentage of pixels is doubtful.
 _DOUBTFUL_PERCENT = 1.0
+# Share of occluded pixels from which an estimate is wrong as a whole.
+_MOSTLY_OCCLUDED = 0.5
 # A network is less accurate near the ends of its range.
 _MARGIN_PX = 4
 # Disparities that are outside a given range by more than this are wrong, not just rounded.
@@ -299,7 +301,10 @@ def _find_wider_range(
 def _find_doubtful(found: Estimate, max_disparity_px: float) -> Bool[np.ndarray, "h w"]:
     """Return the mask of uncertain pixels, whose true disparity may be outside the network's range."""
     near_end = np.abs(found.disparity_px - max_disparity_px / 2) > max_disparity_px / 2 - _MARGIN_PX
-    doubtful = (found.confidence < _CONFIDENT) & ~found.occluded
+    doubtful = found.confidence < _CONFIDENT
+    # Where the matches of most pixels lie outside the right picture, the range is wrong.
+    if found.occluded.mean() < _MOSTLY_OCCLUDED:
+        doubtful &= ~found.occluded
     doubtful |= (near_end & (found.confidence < _CONFIDENT_AT_END)) | (found.disparity_px <= 0)
     # Keep larger areas only: a network is uncertain at every edge.
     small = cv2.resize(doubtful.astype(np.float32), None, fx=1 / 8, fy=1 / 8, interpolation=cv2.INTER_AREA)

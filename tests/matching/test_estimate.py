@@ -186,6 +186,20 @@ def test_slightly_negative_disparities_are_matched(matcher, rng, by_px):
     assert abs(np.median(found_px[80:160, 270:370]) - (by_px - 40)) < 0.5
 
 
+def test_a_small_pair_whose_disparities_are_all_negative_is_matched(matcher, textured):
+    """The network finds matches left of the right picture, so almost all pixels seem to be occluded."""
+    smaller = sw.StereoPair(
+        left=cv2.resize(textured.left, (128, 96), interpolation=cv2.INTER_AREA),
+        right=cv2.resize(textured.right, (128, 96), interpolation=cv2.INTER_AREA),
+    )
+    narrow = moved(smaller, 25)
+    assert matcher.estimate(narrow.left, narrow.right).occluded.mean() > 0.5
+    found, given = match(matcher, narrow), match(matcher, narrow, MatchOptions(range_px=(-27, 20)))
+    assert np.median(given.disparity_px) < 0
+    assert abs(np.median(found.disparity_px) - np.median(given.disparity_px)) < 1
+    assert found.confidence.mean() > 0.5
+
+
 @pytest.fixture(scope="module")
 def best():
     return Matcher("best")
