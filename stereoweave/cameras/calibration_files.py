@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from stereoweave.cameras.rig import Optics, Rig, Size, make_rectified_rig, pair_size_px
+from stereoweave.cameras.rig import Optics, Rig, Size, format_size, make_rectified_rig, pair_size_px
 from stereoweave.errors import Note, Remedy, StereoweaveError
 from stereoweave.io.files import read_small, reading, replacing
 from stereoweave.io.structured_text import BASE64, parse_entries
@@ -22,6 +22,8 @@ from stereoweave.stereo import StereoPair
 
 _MM_ABOVE = 2.0
 _YES, _NO = ("true", "yes", "on", "y"), ("false", "no", "off", "n")
+# Rectified pictures may be off-centre, but their principal point is within this share of their sides.
+_OFF_CENTRE = 0.25
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 _FISHEYE_NAMES = {"fisheye", "equidistant", "equi", "kannalabrandt", "kb4"}
 _PINHOLE_NAMES = {"pinhole", "radtan", "plumbbob", "rationalpolynomial", "brownconrady", "none"}
@@ -67,7 +69,24 @@ def read_rig(path: str | Path, size_px: Size | None = None) -> Rig:
             rig = _parse_kalibr(entries)
         else:
             rig = _parse_opencv(_add_companion(entries, Path(path)))
-        return replace(rig, name=str(path))
+        return replace(rig, name=str(path), notes=(*rig.notes, *_note_size(rig, size_px)))
+
+
+def _note_size(rig: Rig, size_px: Size | None) -> list[Note]:
+    """Return a note if a rig of unknown size seems to be for pictures of a different size."""
+    if rig.size_px or not size_px:
+        return []
+    centre_px = rig.left.matrix[:2, 2]
+    if (np.abs(centre_px / size_px - 0.5) < _OFF_CENTRE).all():
+        return []
+    column, row = centre_px
+    text = (
+        f"the calibration seems to be for pictures of another size: its principal point, {column:.0f}, "
+        f"{row:.0f}, is far from the centre of {format_size(size_px)}"
+    )
+    return [
+        Note(text, Remedy("scale its focal lengths and principal points with the pictures", ("calibration",)))
+    ]
 
 
 def read_calibration_bytes(path: str | Path) -> bytes:

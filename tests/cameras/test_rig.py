@@ -194,6 +194,19 @@ def test_kittis_colour_cameras_are_read_from_calib_txt(tmp_path):
     assert "camera 2 is used as the left one" in rig.notes[0].text
 
 
+def test_a_calibration_without_a_size_is_doubted_if_its_centre_is_far_from_the_pictures(tmp_path):
+    path = stored(tmp_path, KITTI)
+    fitting, halved = (read_rig(path, size_px).notes for size_px in ((1242, 375), (621, 188)))
+    assert len(fitting) == 1
+    assert halved[:-1] == fitting
+    assert str(halved[-1]) == (
+        "the calibration seems to be for pictures of another size: its principal point, 600, 170, is far "
+        "from the centre of 621x188; scale its focal lengths and principal points with the pictures "
+        "(calibration)"
+    )
+    assert read_rig(stored(tmp_path, MIDDLEBURY), (160, 120)).notes == ()  # `check_size` refuses this size
+
+
 def test_kittis_grey_cameras_are_read_where_the_colour_ones_are_missing(tmp_path):
     camera = read_rig(stored(tmp_path, "\n".join(KITTI.splitlines()[:2]))).camera()
     assert camera.baseline_m == 0.5
