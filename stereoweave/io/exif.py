@@ -41,6 +41,7 @@ class Lens:
 
     Attributes:
         focal_px: Focal length in pixels of one view; None if unknown.
+        principal_point_px: Column and row of the left view's principal point; None if unknown.
         baseline_m: Distance between the two lenses in metres; None if unknown.
         convergence_px: Disparity that the camera's maker shows in the plane of the screen; None if unknown.
         parallel: Whether the metadata states that both cameras look into the same direction.
@@ -48,6 +49,7 @@ class Lens:
     """
 
     focal_px: float | None = None
+    principal_point_px: tuple[float, float] | None = None
     baseline_m: float | None = None
     convergence_px: float | None = None
     parallel: bool = False

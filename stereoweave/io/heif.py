@@ -7,7 +7,7 @@ disparity adjustment, so these are read here from the file's boxes (ISO/IEC 1449
 import math
 import re
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -43,6 +43,8 @@ _DISPARITY_ADJUSTMENT = bytes.fromhex("de22508536cb436587432f8705e7c78a")
 
 # Flag of a pose with a direction. Without it, the camera looks along the axis of its group.
 _HAS_DIRECTION = 8
+# A camera's principal point is within this share of the side from the picture's centre.
+_OFF_CENTRE = 1 / 8
 
 
 class DeepPicture(NamedTuple):
@@ -134,8 +136,8 @@ def find_views(picture: Any) -> list[int]:
 def read_lens(path: Path, picture: Any) -> exif.Lens | None:
     """Return the cameras of a spatial photo whose left view is current; None if the file tells nothing.
 
-    The focal length comes from the left view's intrinsic matrix, the baseline from both views' positions,
-    the convergence from Apple's disparity adjustment.
+    Focal length and principal point come from the left view's intrinsic matrix, the baseline from both
+    views' positions, the convergence from Apple's disparity adjustment.
     """
     width_px, height_px = picture.size
     matrix = picture.info.get("heif", {}).get("camera_intrinsic_matrix", {})
@@ -147,12 +149,23 @@ def read_lens(path: Path, picture: Any) -> exif.Lens | None:
     left, right = poses if len(poses) == 2 else (None, None)
     lens = exif.Lens(
         focal_px=focal_px,
+        principal_point_px=_read_principal_point_px(matrix, picture.size) if focal_px else None,
         baseline_m=(math.dist(left.position_m, right.position_m) or None) if left and right else None,
         convergence_px=None if adjusted is None else adjusted * width_px,
         parallel=bool(left and right and left.direction == right.direction),
         source="the HEIC file",
     )
     return lens if lens.is_known else None
+
+
+def _read_principal_point_px(
+    matrix: Mapping[str, Any], size_px: tuple[int, int]
+) -> tuple[float, float] | None:
+    """Return the principal point, counted from the centre of the first pixel; None if it is implausible."""
+    found = [matrix.get(f"principal_point_{axis}", math.nan) for axis in "xy"]
+    if any(not abs(at - side / 2) <= side * _OFF_CENTRE for at, side in zip(found, size_px, strict=True)):
+        return None
+    return found[0] - 0.5, found[1] - 0.5
 
 
 def name_hdr(picture: Any) -> str | None:

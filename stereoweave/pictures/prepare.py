@@ -178,6 +178,9 @@ def _find_camera(
     baseline_m = lens.baseline_m if request.baseline_m is None else request.baseline_m
     if focal_px is not None and baseline_m is not None:
         camera = StereoCamera.centred(pair.left, focal_px=focal_px, baseline_m=baseline_m)
+        if lens.principal_point_px and request.focal_px is None:
+            cx_px, cy_px = lens.principal_point_px
+            camera = replace(camera, cx_px=cx_px, cy_px=cy_px)
         read = [] if request.focal_px is not None else [f"focal length {focal_px:.0f} px"]
         read += [] if request.baseline_m is not None else [f"baseline {1000 * baseline_m:.1f} mm"]
         read += [] if lens.convergence_px is None else [f"convergence {lens.convergence_px:.0f} px"]

@@ -13,6 +13,7 @@ from stereoweave.io.boxes import change_boxes, make_box, split_boxes
 from stereoweave.io.images import write_image
 from stereoweave.io.spatial_photos import mark_views, write_spatial_photo
 from stereoweave.pictures.loading import open_pictures
+from stereoweave.pictures.prepare import Request, prepare
 from stereoweave.stereo import StereoCamera
 
 CAMERA = StereoCamera(focal_px=240.0, baseline_m=0.0635, cx_px=79.5, cy_px=47.5)
@@ -170,6 +171,20 @@ def test_the_command_view_writes_a_spatial_photo(tmp_path, capsys):
     assert np.abs(open_pictures([tmp_path / "photo.heic"]).pair.left.astype(int) - LEFT).mean() < 5
     assert main([*words, str(tmp_path / "photo.heic"), "--layout", "quilt"]) == 2
     assert "expected the layout side_by_side for this extension, found quilt" in capsys.readouterr().err
+
+
+def test_the_principal_point_of_a_spatial_photo_is_that_of_its_pair(tmp_path):
+    camera = replace(CAMERA, cx_px=90.25, cy_px=40.5)
+    write_spatial_photo(tmp_path / "photo.heic", LEFT, RIGHT, camera)
+    found = prepare([tmp_path / "photo.heic"], Request(rectify=False)).pair.camera
+    assert (found.cx_px, found.cy_px) == pytest.approx((90.25, 40.5), abs=1e-6)
+    given = prepare([tmp_path / "photo.heic"], Request(focal_px=200.0, rectify=False)).pair.camera
+    assert (given.cx_px, given.cy_px) == (79.5, 47.5)
+
+
+def test_an_implausible_principal_point_is_taken_for_unknown(tmp_path):
+    write_spatial_photo(tmp_path / "photo.heic", LEFT, RIGHT, replace(CAMERA, cx_px=120.0))
+    assert open_pictures([tmp_path / "photo.heic"]).lens.principal_point_px is None
 
 
 def test_a_view_of_a_spatial_photo_keeps_its_camera_unless_it_is_shifted(tmp_path):
