@@ -59,9 +59,9 @@ class Prepared:
     """A pair ready for matching, its picture files, and notes on what was detected or changed.
 
     `alignment` is the alignment of the pair, if it has been measured. `remedy` is what to do if rows are
-    apart nevertheless. `is_new` says whether the left picture is in no file: the pair was rectified or
-    swapped, or its file holds both views. `sphere` is the window of a VR180 or 360-degree picture, and
-    `baseline_m` the distance of its eyes, if known.
+    apart nevertheless. `is_new` says whether the left picture is in no file: the pair was rectified, swapped
+    or turned by one picture's orientation, or its file holds both views. `sphere` is the window of a VR180 or
+    360-degree picture, and `baseline_m` the distance of its eyes, if known.
     """
 
     pair: StereoPair
@@ -97,7 +97,7 @@ def prepare(pictures: Sequence[Path], request: Request) -> Prepared:
             pictures=tuple(pictures),
             notes=(*opened.notes, *ready.notes),
             remedy=CALIBRATE_AGAIN,
-            is_new=_is_new(pictures, opened.pair, ready.pair),
+            is_new=_is_new(pictures, opened, ready.pair),
         )
     lens = opened.lens or Lens()
     camera, notes = _find_camera(opened.pair, lens, request)
@@ -113,7 +113,7 @@ def prepare(pictures: Sequence[Path], request: Request) -> Prepared:
         notes=(*opened.notes, *notes, *found.notes),
         alignment=found.alignment,
         remedy=RECTIFY if rectified is False else CALIBRATE,
-        is_new=_is_new(pictures, opened.pair, found.pair),
+        is_new=_is_new(pictures, opened, found.pair),
     )
 
 
@@ -150,9 +150,9 @@ def _prepare_window(pictures: Sequence[Path], opened: Opened, request: Request) 
     )
 
 
-def _is_new(pictures: Sequence[Path], opened: StereoPair, ready: StereoPair) -> bool:
+def _is_new(pictures: Sequence[Path], opened: Opened, ready: StereoPair) -> bool:
     """Return whether the left picture to match is in no file (see `Prepared`)."""
-    return len(pictures) == 1 or ready.left is not opened.left
+    return len(pictures) == 1 or opened.turned_alike or ready.left is not opened.pair.left
 
 
 def _apply_calibration(pair: StereoPair, path: Path, rectified: bool) -> Rectified:

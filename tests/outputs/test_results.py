@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image
+from PIL.ExifTags import Base
 
 from stereoweave.cli.depth import depth
 from stereoweave.cli.root import main
@@ -101,6 +102,17 @@ def test_the_left_picture_is_written_where_the_maps_fit_none_of_the_user_s(folde
     assert any("swapped back" in str(note) for note in notes)
     np.testing.assert_array_equal(read_image("swapped/matched_left.png"), read_image("left.png"))
     assert "the left picture to which the maps belong" in Path("swapped/report.html").read_text()
+
+
+def test_the_left_picture_is_written_if_it_was_turned_as_the_right_one(folder):
+    upright = read_image("left.png")
+    for name, orientation in zip(PICTURES, ({}, {Base.Orientation: 6}), strict=True):
+        exif = Image.Exif()
+        exif.update(orientation)
+        with Image.open(name) as picture:
+            picture.transpose(Image.Transpose.ROTATE_90).save(name, exif=exif)
+    make_depth(PICTURES, Path("out"), PLAIN)
+    np.testing.assert_array_equal(read_image("out/matched_left.png"), upright)
 
 
 def test_the_left_half_of_a_file_with_both_views_is_written(folder):
