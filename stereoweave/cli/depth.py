@@ -216,7 +216,8 @@ def measure(  # noqa: PLR0913 - each is an option of the command line
 ) -> None:
     """Measure the distance in metres between two points.
 
-    The points are pixels of the left picture or, with --rectify, of the rectified left picture. The
+    The points are pixels of the left picture or, with --rectify, of matched_left.png as depth --rectify
+    writes it; to measure in the cropped pictures that rectify writes, give those with their calib.yml. The
     uncertainty of the distance is reported too.
     """
     from stereoweave.cameras.diagnosis import find_problems
