@@ -75,6 +75,11 @@ def open_container(path: Path) -> "av.container.InputContainer":
         raise FormatError(f"{path}: expected a video, found {_describe_unopened(path, error)}") from error
 
 
+def find_sound_streams(container: "av.container.InputContainer") -> "list[av.AudioStream]":
+    """Return the streams of sound whose codecs FFmpeg knows; it cannot copy others."""
+    return [stream for stream in container.streams.audio if stream.codec_context is not None]
+
+
 def refuse_playlist(path: Path) -> None:
     """Raise FormatError if a file is a playlist, or is unreadable."""
     with reading(path, "a video"), path.open("rb") as file:

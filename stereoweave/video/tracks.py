@@ -19,7 +19,7 @@ from stereoweave.video.packings import FRAME_SEQUENTIAL
 from stereoweave.video.picture_track import SAMPLED_AT, PictureTrack, list_picture_files
 from stereoweave.video.spatial import RIGHT, Stereo3D, ViewPair, is_spatial, pair_views, read_stereo3d
 from stereoweave.video.sphere_marks import read_sphere
-from stereoweave.video.streams import decode, drop_corrupt, open_stream
+from stereoweave.video.streams import decode, drop_corrupt, find_sound_streams, open_stream
 from stereoweave.video.timestamps import (
     choose_rate,
     fill_missing,
@@ -79,13 +79,17 @@ class VideoTrack:
         self.name = str(path) if stream_index is None else f"{path}, stream {stream_index}"
         self._path, self._index = path, stream_index
         with self._opening() as (container, stream):
-            self.sound = path if container.streams.audio else None
+            known = find_sound_streams(container)
+            self.sound, unknown = path if known else None, len(container.streams.audio) - len(known)
             self._read_times(container, stream)
         with self._opening() as (container, stream):
             first = next(drop_corrupt(decode(container, stream)), None)
             if first is None:
                 raise FormatError(f"{self.name}: expected a video, found a file without a decodable frame")
             self._describe(first, stream)
+        if unknown:
+            tracks = "1 sound track" if unknown == 1 else f"{unknown} sound tracks"
+            self.notes.append(Note(f"{tracks} of a codec that FFmpeg does not know: left out"))
 
     def _opening(self) -> AbstractContextManager[tuple["av.container.InputContainer", "av.VideoStream"]]:
         return open_stream(self._path, self._index)

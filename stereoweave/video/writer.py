@@ -30,7 +30,7 @@ from jaxtyping import UInt8, UInt16
 from stereoweave.errors import Remedy, StereoweaveError
 from stereoweave.io.files import replacing
 from stereoweave.video.mp4_marks import VideoMarks, show_bounds, write_marks
-from stereoweave.video.streams import open_container
+from stereoweave.video.streams import find_sound_streams, open_container
 
 if TYPE_CHECKING:  # PyAV's types have parameters that its classes lack
     from av.packet import Packet
@@ -282,7 +282,7 @@ def check_container(path: Path, sound: Path | None) -> None:
     if sound is None or _can_hold(path.suffix, sound):
         return
     with open_container(sound) as source:
-        codecs = ", ".join(sorted({stream.codec_context.name for stream in source.streams.audio}))
+        codecs = ", ".join(sorted({stream.codec_context.name for stream in find_sound_streams(source)}))
     others = [ending for ending in CONTAINERS if _can_hold(ending, sound)]
     remedy = f"use {others[0]} instead" if others else "convert the sound first, for example to FLAC"
     raise StereoweaveError(
@@ -304,7 +304,7 @@ def _can_hold(ending: str, sound: Path) -> bool:
 def _copy_sound_streams(source: InputContainer, output: OutputContainer) -> dict[int, AudioStream]:
     """Add each audio stream in the source to the output, and return the new streams by source index."""
     streams = {}
-    for stream in source.streams.audio:
+    for stream in find_sound_streams(source):
         streams[stream.index] = copy = output.add_stream_from_template(stream, opaque=True)
         copy.metadata.update(stream.metadata)
         copy.disposition = stream.disposition
@@ -314,7 +314,7 @@ def _copy_sound_streams(source: InputContainer, output: OutputContainer) -> dict
 def _read_sound(source: InputContainer, streams: Mapping[int, AudioStream]) -> Iterator[AnyPacket]:
     """Yield the audio packets of a source, assigned to the new streams."""
     with suppress(FFmpegError):  # a file that ends early is reported by `StereoVideo`
-        for packet in _drop_empty(source.demux(*source.streams.audio)):
+        for packet in _drop_empty(source.demux(*find_sound_streams(source))):
             packet.stream = streams[packet.stream_index]
             yield packet
 

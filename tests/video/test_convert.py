@@ -72,6 +72,32 @@ def test_a_conversion_keeps_uneven_frame_times_and_the_sound(tmp_path, capsys):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in.mp4", "out.mp4"]
 
 
+@pytest.mark.parametrize("known", [1, 0])
+def test_sound_of_an_unknown_codec_is_left_out_with_a_note(tmp_path, capsys, known):
+    """iPhones write a second track of spatial sound, whose codec FFmpeg does not know."""
+    source = write_side_by_side(tmp_path / "source.mp4", example_pairs(3), sound=True, codec="libx264")
+    video = tmp_path / "in.mov"
+    with av.open(str(source)) as given, av.open(str(video), "w") as made:
+        tracks = [*given.streams.video, *(given.streams.audio[0],) * (known + 1)]
+        copies = [made.add_stream_from_template(track) for track in tracks]
+        for packet in given.demux():
+            for copy, track in zip(copies, tracks, strict=True):
+                if packet.size and packet.stream_index == track.index:
+                    packet.stream = copy
+                    made.mux(packet)
+    content = video.read_bytes()
+    last = content.rindex(b"stsd")
+    video.write_bytes(content[:last] + content[last:].replace(b"mp4a", b"apac").replace(b"esds", b"dapa"))
+    out = tmp_path / "out.mov"
+    assert run(video, out, "--format", "side_by_side", "--position", "0.5") == 0
+    told = " ".join(capsys.readouterr().err.split())
+    assert "1 sound track of a codec that FFmpeg does not know: left out" in told
+    with av.open(str(out)) as made:
+        assert len(made.streams.audio) == known
+    if known:
+        assert packets(out, "audio") == packets(source, "audio")
+
+
 def aspect_of(video: Path) -> Fraction | None:
     with av.open(str(video)) as container:
         return container.streams.video[0].sample_aspect_ratio
