@@ -78,16 +78,18 @@ def check_frame(frame: StereoFrame, matcher: Matcher) -> FrameCheck:
         defects.append("swapped")
     if colour_stops > _TOLERATED_COLOUR_STOPS:
         defects.append("colour")
+    depth = _find_depth(alignment, estimate, scale)
     return FrameCheck(
         time=frame.time,
-        depth=_find_depth(alignment, estimate, scale),
+        depth=depth,
         rows_px=alignment.vertical_error_px,
         shift_px=alignment.vertical_shift_px,
         rotation_degrees=alignment.rotation_degrees,
         larger_percent=100 * (alignment.scale - 1),
         exposure_stops=exposure_stops,
         colour_stops=colour_stops,
-        windows_px=_find_cut_px(alignment, pair, estimate, scale),
+        # Without confident pixels, nothing is known to be near.
+        windows_px=_find_cut_px(alignment, pair, estimate, scale) if depth else (0.0, 0.0),
         defects=tuple(defects),
     )
 

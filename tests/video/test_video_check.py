@@ -206,6 +206,13 @@ ODD_VIDEOS = {
 }
 
 
+def test_a_title_before_a_film_that_suits_the_screen_is_no_defect(tmp_path, capsys):
+    make, *_ = ODD_VIDEOS["a title before"]
+    video = write_side_by_side(tmp_path / "film.mp4", make(), codec="libx264")
+    run(video, "--format", "side_by_side", "--screen", "phone")
+    assert "shot 1: near objects are cut off" not in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("name", ODD_VIDEOS)
 def test_an_odd_video_gets_a_line(name, tmp_path, capsys):
     make, status, words = ODD_VIDEOS[name]
