@@ -247,8 +247,7 @@ def _process_pair(out: Path, job: DepthJob, pair: NamedPair) -> str | None:
         folder, sources = out / pair.name, _describe_sources(pair)
         job = replace(job, backend=_pin(job.backend))
         (folder / DONE_FILE).unlink(missing_ok=True)
-        if pair.calibration and not job.request.calibration:
-            job = replace(job, request=replace(job.request, calibration=pair.calibration))
+        job = replace(job, request=job.request.complete(pair.calibration))
         start_s = time.perf_counter()
         made = make_depth(pair.pictures, folder, job, owns_out=True)
         seconds = round(time.perf_counter() - start_s, 3)

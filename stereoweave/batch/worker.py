@@ -196,8 +196,7 @@ class ChunkWorker:
 
     def _process_pair(self, entry: PlanEntry, scratch: Path, job: DepthJob) -> ManifestRow:
         pictures, calibration = self._fetch(entry, scratch / "pictures")
-        if calibration and not job.request.calibration:
-            job = replace(job, request=replace(job.request, calibration=calibration))
+        job = replace(job, request=job.request.complete(calibration))
         with self._open_results(entry, scratch) as out:
             made = make_depth(pictures, out, job, owns_out=True)
         summary = made.summary

@@ -53,6 +53,13 @@ class Request:
                 remedy=Remedy("omit one of them", ("calibration", "focal_px", "baseline_m")),
             )
 
+    def complete(self, calibration: Path | None) -> "Request":
+        """Return the request with a pair's own calibration, unless the user's settings give a camera."""
+        given = (self.calibration, self.focal_px, self.baseline_m)
+        if calibration is None or any(value is not None for value in given):
+            return self
+        return replace(self, calibration=calibration)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Prepared:

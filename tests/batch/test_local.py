@@ -336,6 +336,20 @@ def test_a_scenes_own_calibration_is_used_unless_one_is_given_for_all_scenes(tmp
     assert np.median(other_mm / own_mm) == pytest.approx(2, rel=1e-3)
 
 
+def test_a_focal_length_and_a_baseline_replace_a_scenes_own_calibration(tmp_path):
+    folder = tmp_path / "scenes"
+    (folder / "room").mkdir(parents=True)
+    for name in ("left.png", "right.png", "calib.txt"):
+        (folder / "room" / name).write_bytes((TEXTURED / name).read_bytes())
+    job = DepthJob(request=Request(focal_px=500.0, baseline_m=0.1))
+    tally, _ = run_quietly(folder, tmp_path / "out", job, processes=1)
+    assert tally == LocalTally(done=1, skipped=0, failed=(), warned=())
+    disparity_px = read_pixels(tmp_path / "out" / "room" / "disparity.png", "I;16") / 256
+    depth_mm = read_pixels(tmp_path / "out" / "room" / "depth.png", "I;16")
+    seen = (disparity_px > 1) & (depth_mm > 0)
+    np.testing.assert_allclose((depth_mm * disparity_px)[seen], 1000 * 500 * 0.1, rtol=0.01)
+
+
 def test_the_command_takes_a_list_and_writes_reports_only_on_request(tmp_path, capsys):
     folder, out = write_pairs(tmp_path / "pairs", 2), tmp_path / "out"
     (folder / "list.txt").write_text("left/00.png right/00.png quay\nleft/01.png right/none.png\n")
