@@ -10,7 +10,7 @@ from stereoweave.cameras.rectify_uncalibrated import fit_warps
 from stereoweave.errors import Note, Remedy, StereoweaveError
 from stereoweave.stereo import StereoPair
 
-_SWAPPED = Note("left and right were swapped, and have been swapped back")
+SWAPPED_BACK = Note("left and right were swapped, and have been swapped back")
 _NO_BETTER = Note("the pair was not rectified, because its rows would not come closer")
 KEEP = Remedy("the pictures can also be kept as they are", ("no_rectify",))
 # The disparities of a pair out of line may have any sign. Left and right are swapped if the vote on the depth
@@ -55,7 +55,7 @@ def align(pair: StereoPair, *, always: bool = False, parallel: bool = False) -> 
     if not suspicious or _find_depth_order(aligned) >= _SWAPPED_VOTE:
         return aligned
     other = rectify(swap(pair))
-    return replace(other, swapped=True, notes=(_SWAPPED, *other.notes))
+    return replace(other, swapped=True, notes=(SWAPPED_BACK, *other.notes))
 
 
 def align_rows(pair: StereoPair, *, parallel: bool = False, keep_screen: bool = False) -> Aligned:

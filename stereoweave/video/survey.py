@@ -15,7 +15,7 @@ from jaxtyping import Float
 from rich.progress import Progress
 
 from stereoweave.cameras.alignment import RECTIFY, SWAPPED, check_pair
-from stereoweave.cameras.auto_align import Aligned, align
+from stereoweave.cameras.auto_align import SWAPPED_BACK, Aligned, align
 from stereoweave.cameras.diagnosis import CALIBRATE, CALIBRATE_AGAIN, find_problems
 from stereoweave.errors import Note, Remedy
 from stereoweave.io.colormap import find_colour_range_px
@@ -103,7 +103,8 @@ def survey_video(
         _find_match_range_px(all_px, matcher),
         2 * sum(sample.swapped for sample in samples) > len(samples),
     )
-    return survey, [*video.notes, *_note_flat(samples), *_select_common_notes(defects)]
+    swapped = [SWAPPED_BACK] if survey.swapped else []
+    return survey, [*video.notes, *_note_flat(samples), *swapped, *_select_common_notes(defects)]
 
 
 def _sample_frames(
@@ -163,7 +164,8 @@ def _sample_frame(
         scale * median_disparity_px(estimate),
         aligned.swapped,
         _is_flat(aligned),
-        list(aligned.notes) if checked else None,
+        # The survey decides for the whole video whether it is swapped.
+        [note for note in aligned.notes if note != SWAPPED_BACK] if checked else None,
     )
     if sample.notes is not None and not sample.flat:
         seen_by = replace(aligned.pair, camera=camera)
