@@ -57,7 +57,7 @@ def convert_still(upload: VideoUpload, report: Callable[[float, str], None]) -> 
     )
     with closing(FrameConverter(job, survey, still.size_px).convert(still.frames())) as converted:
         list(converted)
-    last_s = float((video.frame_count - 1) * frame_s)
+    last_s = float(video.length_s - frame_s)
     return StillFrame(
         make_pictures(seen[0], upload.output, begin_s=start_s, longer_side_px=_LONGER_SIDE_PX),
         floor(last_s * _STEPS_PER_S) / _STEPS_PER_S,

@@ -228,8 +228,7 @@ def _name_file(upload: VideoUpload, video: "StereoVideo", folder: Path) -> Path:
 def _describe(upload: VideoUpload, video: "StereoVideo") -> str:
     """Describe a converted video in one line."""
     width, height = video.size_px
-    length_s = float(video.frame_count / video.rate)
-    frames = f"{video.frame_count} frames of {width}×{height} px, {length_s:.1f} s"
+    frames = f"{video.frame_count} frames of {width}×{height} px, {float(video.length_s):.1f} s"
     packing = f", read as {video.frame_packing.replace('_', ' ')}" if video.frame_packing else ""
     return f"{OUTPUTS[upload.output].label}: {frames}{packing}. {OUTPUTS[upload.output].viewing}"
 

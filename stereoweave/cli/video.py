@@ -266,8 +266,7 @@ def _parse_length_s(preview: str) -> float:
 
 def _cut_from_middle(video: "StereoVideo", length_s: float) -> "StereoVideo":
     """Return a part of this length from the middle of the video, whose start may be a title."""
-    whole_s = float(video.frame_count / video.rate)
-    return video.excerpt(max(0.0, (whole_s - length_s) / 2), length_s)
+    return video.excerpt(max(0.0, (float(video.length_s) - length_s) / 2), length_s)
 
 
 def _add_mark(out: Path, layout: str, size_px: tuple[int, int]) -> Path:

@@ -2,6 +2,7 @@
 
 import copy
 import math
+from bisect import bisect_left
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from fractions import Fraction
@@ -39,6 +40,8 @@ _REPEATED_LAST, _REPEATED_NEXT = (
     "damaged: replaced by the frame after it",
 )
 _AFTER_DAMAGE = "decoded from a damaged frame before it"
+# Error of a time that is given in seconds with three decimals.
+_ROUNDED_S = 0.0005
 _RETIMED = "its timestamp was missing or a duplicate, so it is shown slightly later"
 
 
@@ -188,22 +191,34 @@ class StereoVideo:
         Raises:
             StereoweaveError: The video ends before the part begins.
         """
-        first = self._count_frames(start_s)
-        if not 0 <= first < self.frame_count:
-            length = format_frame_time(self.frame_count / self.rate)
+        first = self._find_frame(start_s)
+        if start_s < 0 or first >= self.frame_count:
+            length = format_frame_time(self.length_s)
             raise StereoweaveError(
                 f"expected a start within the video of {length}, found {start_s:g} s; choose an earlier one"
             )
         part = copy.copy(self)
         part._first = self._first + first
-        part.frame_count = min(max(1, self._count_frames(length_s)), self.frame_count - first)
+        wanted = self._find_frame(length_s, first) - first
+        part.frame_count = min(max(1, wanted), self.frame_count - first)
         part.excerpted = f"{part._first}+{part.frame_count}"
         part.sound = None
         return part
 
-    def _count_frames(self, length_s: float) -> int:
-        """Return the number of frames that begin before this time; a decimal time may be off by rounding."""
-        return math.ceil(round(length_s * float(self.rate), 6))
+    @property
+    def length_s(self) -> Fraction:
+        """Time from the beginning of the first frame to the end of the last one."""
+        steps = self._tracks[0].steps
+        last = steps[self._first + self.frame_count - 1]
+        return (last - steps[self._first]) * self.time_base + 1 / self.rate
+
+    def _find_frame(self, after_s: float, start: int = 0) -> int:
+        """Return the number of the first frame that begins at least this time after frame number `start`."""
+        steps, begin = self._tracks[0].steps, self._first + start
+        # Decimal times are rounded, and some files round those of their frames to milliseconds.
+        rounded_s = min(_ROUNDED_S, 0.25 / float(self.rate))
+        step = steps[begin] + math.ceil((after_s - rounded_s) / float(self.time_base))
+        return bisect_left(steps, step, begin) - self._first
 
     def frames(self, start: int = 0) -> Iterator[StereoFrame]:
         """Yield the frames from number `start` on, the same as if reading had begun at the first frame.

@@ -468,6 +468,17 @@ def test_frames_can_be_read_twice_at_the_same_time(tmp_path):
     assert all(b.time - a.time == Fraction(FRAME_MS, 1000) for a, b in pairwise(video.frames()))
 
 
+def test_an_excerpt_of_uneven_frames_begins_and_ends_by_their_times(tmp_path):
+    """One second of 30 frames a second is followed by one of 10."""
+    times_ms = [*(1000 * index // 30 for index in range(30)), *range(1000, 2000, 100)]
+    path = write_side_by_side(tmp_path / "video.mkv", flat_pairs(40, width=32), times_ms=times_ms)
+    video = open_video([path], "side_by_side")
+    assert float(video.length_s) == pytest.approx(1.95, abs=0.01)  # the last frame lasts as long as the mean
+    assert video.excerpt(1.1, 0.3).excerpted == "31+3"
+    assert video.excerpt(0.5, 0.1).excerpted == "15+3"
+    assert video.excerpt(0.9, 0.3).excerpted == "27+5"
+
+
 def test_an_excerpt_is_a_silent_video_of_its_own(tmp_path):
     path = write_side_by_side(tmp_path / "video.mkv", flat_pairs(10), sound=True)
     part = open_video([path], "side_by_side").excerpt(0.11, 0.2)  # frames 3 to 7 of 25 a second
