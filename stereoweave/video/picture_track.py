@@ -43,7 +43,7 @@ class PictureTrack:
 
     def __init__(self, name: str, files: Sequence[Path], rate: Fraction) -> None:
         self.name = name
-        self._files = files
+        self.files = files
         self.steps: Sequence[int] = range(len(files))
         self.rate, self.time_base = rate, 1 / rate
         first = self._read_first()
@@ -59,14 +59,14 @@ class PictureTrack:
 
     def samples(self) -> list[UInt8[np.ndarray, "h w 3"]]:
         """Return one or more images from different parts of the series."""
-        starts = [int(share * len(self._files)) for share in (0.0, *SAMPLED_AT)]
+        starts = [int(share * len(self.files)) for share in (0.0, *SAMPLED_AT)]
         frames = [frame for start in starts for frame in islice(self.frames(start), 1)]
         return [picture for frame in frames for picture in frame.pictures()]
 
     def _read_first(self) -> UInt8[np.ndarray, "h w 3"]:
         """Return the first picture that can be read."""
         problem: FormatError | None = None
-        for file in self._files:
+        for file in self.files:
             try:
                 return read_image(file)
             except FormatError as error:
@@ -81,10 +81,27 @@ class PictureTrack:
 
     def _read_picture(self, index: int) -> UInt8[np.ndarray, "h w 3"] | None:
         with suppress(FormatError):
-            picture = read_image(self._files[index])
+            picture = read_image(self.files[index])
             if self.size_px == (picture.shape[1], picture.shape[0]):
                 return picture
         return None
+
+
+def check_numbers(left: PictureTrack, right: PictureTrack) -> None:
+    """Raise FormatError if a picture is missing in one of two series, as the numbers in the names show."""
+    names = [[file.name for file in track.files] for track in (left, right)]
+    offset: int | None = None
+    for pair in zip(*names, strict=False):
+        numbers = [re.findall(r"\d+", name)[-1:] for name in pair]
+        if not all(numbers):
+            return
+        apart = int(numbers[0][0]) - int(numbers[1][0])
+        if offset not in (None, apart):
+            raise FormatError(
+                f"{left.name}, {right.name}: expected pictures of the same numbers, found {pair[0]} beside "
+                f"{pair[1]}; add the missing picture, or remove its counterpart"
+            )
+        offset = apart
 
 
 def list_picture_files(path: Path) -> list[Path] | None:

@@ -25,7 +25,7 @@ from stereoweave.pictures.panoramas import SphereView, choose_layout, guess_proj
 from stereoweave.video.frame_sequence import FrameSequence
 from stereoweave.video.mvc import check_not_mvc
 from stereoweave.video.packings import FRAME_PACKINGS, FRAME_SEQUENTIAL, TWO_STREAMS
-from stereoweave.video.picture_track import list_picture_files
+from stereoweave.video.picture_track import PictureTrack, check_numbers, list_picture_files
 from stereoweave.video.times import format_frame_time
 from stereoweave.video.track_frame import TrackFrame
 from stereoweave.video.tracks import Track, VideoTrack, open_track
@@ -259,10 +259,18 @@ class StereoVideo:
             for track, problem in zip(self._tracks, problems, strict=True)
             if problem
         ]
+        if of_two and (apart_s := self._find_offset_s(index)):
+            found.append(f"the left and the right frame are {1000 * float(apart_s):.0f} ms apart")
         found += [_RETIMED] if index in self._tracks[0].retimed else []
         if index == self._last:
             found += [ending for track in self._tracks if (ending := self._describe_ending(track))]
         return "; ".join(found) or None
+
+    def _find_offset_s(self, index: int) -> Fraction | None:
+        """Return how far the frames of two tracks are apart; None for less than half a frame."""
+        left_s, right_s = ((track.steps[index] - track.steps[0]) * track.time_base for track in self._tracks)
+        apart_s = abs(left_s - right_s)
+        return apart_s if apart_s > Fraction(1, 2) / self.rate else None
 
     def _describe_ending(self, track: _Source) -> str | None:
         more = len(track.steps) - (self._last + 1)
@@ -401,7 +409,7 @@ def _check_second_view(track: VideoTrack) -> None:
 
 
 def _check_alike(left: Track, right: Track) -> None:
-    """Raise FormatError unless both videos have the same size and stay in sync to within half a frame."""
+    """Raise FormatError unless both videos have the same size and end in sync, to within half a frame."""
     for track in (left, right):
         if track.is_spatial:
             raise FormatError(
@@ -422,6 +430,8 @@ def _check_alike(left: Track, right: Track) -> None:
             f"{float(ends_s[0]):.3f} s in {left.name} and at {float(ends_s[1]):.3f} s in {right.name}; "
             "convert one of them first"
         )
+    if isinstance(left, PictureTrack) and isinstance(right, PictureTrack):
+        check_numbers(left, right)
 
 
 def _bridge_gaps(track: _Source, start: int, first: int) -> Iterator[tuple[TrackFrame, str | None]]:

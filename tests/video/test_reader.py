@@ -371,6 +371,31 @@ def test_two_videos_end_with_the_shorter_one_and_the_rest_is_reported(tmp_path):
     assert problems(video) == {3: f"{left} has 2 more frames than the other video"}
 
 
+def test_frames_of_two_videos_that_are_apart_are_reported(tmp_path):
+    """The left video lacks frame 2, the right one frame 5, so frames 2 to 4 are 40 ms apart."""
+    paths = []
+    for eye, name, gone in ((0, "left.mkv", 2), (1, "right.mkv", 5)):
+        kept = [index for index in range(8) if index != gone]
+        frames = [pair[eye] for pair in example_pairs(8)]
+        times_ms = [FRAME_MS * index for index in kept]
+        paths.append(write_video(tmp_path / name, [frames[index] for index in kept], times_ms=times_ms))
+    apart = "the left and the right frame are 40 ms apart"
+    assert problems(open_video(paths)) == dict.fromkeys((2, 3, 4), apart)
+
+
+def test_two_series_of_pictures_that_miss_different_numbers_are_refused(tmp_path):
+    pairs = example_pairs(4)
+    write_pictures(tmp_path, "left_{}.png", [left for left, _ in pairs])
+    write_pictures(tmp_path, "right_{}.png", [right for _, right in pairs])
+    patterns = [tmp_path / "left_*.png", tmp_path / "right_*.png"]
+    assert open_video(patterns).frame_count == 4
+    (tmp_path / "left_9.png").unlink()
+    (tmp_path / "right_10.png").unlink()
+    assert "expected pictures of the same numbers, found left_10.png beside right_9.png; " in refusal(
+        *patterns
+    )
+
+
 def test_a_damaged_frame_is_reported_with_the_name_of_its_video(tmp_path):
     pairs = example_pairs(6)
     left = write_video(tmp_path / "left.mkv", [left for left, _ in pairs], codec="mjpeg")
