@@ -95,7 +95,7 @@ def convert_video(
                 video, matcher, bar, rectified=job.rectify, threads=job.backend.threads
             )
             converter = FrameConverter(job, survey, video.size_px)
-            notes += [*_note_aspect(job, video, out), *find_losses(job, survey)]
+            notes += [*_note_sound(video), *_note_aspect(job, video, out), *find_losses(job, survey)]
             converter.tally.notes = [note.format(job.name_of) for note in notes]
             for line in converter.tally.notes:
                 _print_line(console, line)
@@ -131,6 +131,14 @@ def _measure_output_px(job: VideoJob, size_px: tuple[int, int]) -> tuple[int, in
         return size_px
     row, column = np.zeros((1, size_px[0], 3), np.uint8), np.zeros((size_px[1], 1, 3), np.uint8)
     return job.arrangement(row, row).shape[1], job.arrangement(column, column).shape[0]
+
+
+def _note_sound(video: StereoVideo) -> list[Note]:
+    """Return a list with a note if sound is left out."""
+    if not video.unknown_sounds:
+        return []
+    tracks = "1 sound track" if video.unknown_sounds == 1 else f"{video.unknown_sounds} sound tracks"
+    return [Note(f"{tracks} left out, of a codec that FFmpeg does not know")]
 
 
 def _note_aspect(job: VideoJob, video: StereoVideo, out: Path) -> list[Note]:

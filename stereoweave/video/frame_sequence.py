@@ -36,6 +36,7 @@ class FrameSequence:
         self.retimed = {index // 2 for index in track.retimed if index % 2 == 0}
         self.time_base, self.rate = track.time_base, track.rate / 2
         self.size_px, self.sound, self.truncation = track.size_px, track.sound, track.truncation
+        self.unknown_sounds = track.unknown_sounds
         self.pixel_aspect = track.pixel_aspect
         self.sphere, self.own_colours = track.sphere, track.own_colours
         odd = [Note("the last frame is dropped, because no second view follows it")]

@@ -39,6 +39,7 @@ class PictureTrack:
     own_colours: tuple[int, int, int] | None = None
     retimed: Collection[int] = ()
     sound: Path | None = None
+    unknown_sounds = 0
     truncation: str | None = None
 
     def __init__(self, name: str, files: Sequence[Path], rate: Fraction) -> None:

@@ -88,6 +88,7 @@ class StereoVideo:
         time_base: Time unit in seconds; every frame time is a multiple of this unit.
         camera: Camera of the views, as the file declares it or by a calibration; None if it is unknown.
         sound: File that contains the sound; None for a silent video.
+        unknown_sounds: Number of a file's sound tracks that cannot be copied, as FFmpeg does not know them.
         excerpted: Name of the part of a longer video that this is, such as "1440+120" for 120 frames from
             frame 1440 on; None for a whole video.
         notes: Notes on views and colours, and on the column or row that is dropped from frames of odd width
@@ -123,6 +124,7 @@ class StereoVideo:
         self.frame_count = min(len(track.steps) for track in tracks)
         self.rate, self.time_base = first.rate, first.time_base
         self.sound = next((track.sound for track in tracks if track.sound), None)
+        self.unknown_sounds = max(track.unknown_sounds for track in tracks)
         self.on_frame: Callable[[int], None] = lambda number: None
         self.excerpted: str | None = None
         self.declared_sphere = first.sphere
@@ -202,7 +204,7 @@ class StereoVideo:
         wanted = self._find_frame(length_s, first) - first
         part.frame_count = min(max(1, wanted), self.frame_count - first)
         part.excerpted = f"{part._first}+{part.frame_count}"
-        part.sound = None
+        part.sound, part.unknown_sounds = None, 0
         return part
 
     @property

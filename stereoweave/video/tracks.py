@@ -68,7 +68,8 @@ class VideoTrack:
         notes: Notes on views and colours.
         own_colours: Primaries, transfer function and matrix of HDR and of wide colours, by FFmpeg's numbers;
             else None.
-        sound: Path of the file if it has sound, else None.
+        sound: Path of the file if it has sound that can be copied, else None.
+        unknown_sounds: Number of its sound tracks of codecs that FFmpeg does not know.
         truncation: Message about a file that ends early; None for a complete file.
 
     Raises:
@@ -80,16 +81,14 @@ class VideoTrack:
         self._path, self._index = path, stream_index
         with self._opening() as (container, stream):
             known = find_sound_streams(container)
-            self.sound, unknown = path if known else None, len(container.streams.audio) - len(known)
+            self.sound = path if known else None
+            self.unknown_sounds = len(container.streams.audio) - len(known)
             self._read_times(container, stream)
         with self._opening() as (container, stream):
             first = next(drop_corrupt(decode(container, stream)), None)
             if first is None:
                 raise FormatError(f"{self.name}: expected a video, found a file without a decodable frame")
             self._describe(first, stream)
-        if unknown:
-            tracks = "1 sound track" if unknown == 1 else f"{unknown} sound tracks"
-            self.notes.append(Note(f"{tracks} of a codec that FFmpeg does not know: left out"))
 
     def _opening(self) -> AbstractContextManager[tuple["av.container.InputContainer", "av.VideoStream"]]:
         return open_stream(self._path, self._index)

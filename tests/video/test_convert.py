@@ -91,7 +91,7 @@ def test_sound_of_an_unknown_codec_is_left_out_with_a_note(tmp_path, capsys, kno
     out = tmp_path / "out.mov"
     assert run(video, out, "--format", "side_by_side", "--position", "0.5") == 0
     told = " ".join(capsys.readouterr().err.split())
-    assert "1 sound track of a codec that FFmpeg does not know: left out" in told
+    assert "1 sound track left out, of a codec that FFmpeg does not know" in told
     with av.open(str(out)) as made:
         assert len(made.streams.audio) == known
     if known:
