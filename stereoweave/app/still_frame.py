@@ -48,7 +48,7 @@ def convert_still(upload: VideoUpload, report: Callable[[float, str], None]) -> 
     from stereoweave.video.survey import survey_video
 
     start_s, frame_s = upload.start_s or 0.0, 1 / video.rate
-    still = video.excerpt(start_s, float(frame_s / 2))
+    still = video.excerpt(start_s, 0.0)  # of one frame
     report(0.3, "converting one frame")
     seen: list[ConvertedFrame] = []
     job = replace(fit_to_video(make_job(upload, upload.output), still), on_converted=seen.append)

@@ -182,7 +182,7 @@ def check_video(
     for shot, frame in ahead(_take_samples(video, spans, problems), 1):
         found.setdefault(shot, []).append(check_frame(frame, matcher))
     ends = [(span.number, span.time) for span in spans[1:]]
-    ends.append((video.frame_count, Fraction(video.frame_count) / video.rate))
+    ends.append((video.frame_count, video.length_s))
     shots = [
         ShotCheck(
             start_s=span.time,
@@ -201,7 +201,7 @@ def check_video(
 
 def _take_samples(video: StereoVideo, spans: list[_Span], problems: list[str]) -> Iterator[_Sample]:
     """Yield the frames to measure, at least one of each shot; add shots and problems to the lists."""
-    every_s = max(_EVERY_S, video.frame_count / video.rate / _MOST_SAMPLES)
+    every_s = max(_EVERY_S, video.length_s / _MOST_SAMPLES)
     last_grey, due_s = None, Fraction(0)
     waiting: StereoFrame | None = None
     for number, frame in enumerate(video.frames()):
