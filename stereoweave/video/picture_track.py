@@ -1,16 +1,17 @@
 """A series of pictures as a track of frames."""
 
 import re
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import suppress
 from fractions import Fraction
-from itertools import islice
+from itertools import islice, pairwise
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
 
-from stereoweave.errors import FormatError, Note
+from stereoweave.errors import FormatError, Note, Remedy
 from stereoweave.io.decoding import ENDINGS
 from stereoweave.io.images import read_image
 from stereoweave.stereo import StereoCamera
@@ -88,21 +89,32 @@ class PictureTrack:
         return None
 
 
-def check_numbers(left: PictureTrack, right: PictureTrack) -> None:
-    """Raise FormatError if a picture is missing in one of two series, as the numbers in the names show."""
-    names = [[file.name for file in track.files] for track in (left, right)]
-    offset: int | None = None
-    for pair in zip(*names, strict=False):
-        numbers = [re.findall(r"\d+", name)[-1:] for name in pair]
-        if not all(numbers):
-            return
-        apart = int(numbers[0][0]) - int(numbers[1][0])
-        if offset not in (None, apart):
-            raise FormatError(
-                f"{left.name}, {right.name}: expected pictures of the same numbers, found {pair[0]} beside "
-                f"{pair[1]}; add the missing picture, or remove its counterpart"
-            )
-        offset = apart
+def note_numbers(left: PictureTrack, right: PictureTrack) -> list[Note]:
+    """Return a list with a note if a picture seems to be missing in one of two numbered series."""
+    numbers = [_read_numbers(track.files) for track in (left, right)]
+    steps = [_find_step(found) for found in numbers]
+    if None in steps or steps[0] != steps[1]:
+        return []
+    offsets = [one - other for one, other in zip(*numbers, strict=False)]
+    first = next((at for at, offset in enumerate(offsets) if offset != offsets[0]), None)
+    if first is None:
+        return []
+    pair = f"{left.files[first].name} is paired with {right.files[first].name}"
+    missing = Remedy("add the missing picture, or remove its counterpart")
+    return [Note(f"{pair}: a picture seems to be missing in one of the sequences", missing)]
+
+
+def _read_numbers(files: Sequence[Path]) -> list[int]:
+    """Return the last number in each name; none if a name has none."""
+    found = [re.findall(r"\d+", file.stem) for file in files]
+    return [int(numbers[-1]) for numbers in found] if all(found) else []
+
+
+def _find_step(numbers: Sequence[int]) -> int | None:
+    """Return the step in which over half of the numbers rise; None if there is none."""
+    steps = Counter(after - before for before, after in pairwise(numbers))
+    step, count = steps.most_common(1)[0] if steps else (0, 0)
+    return step if 2 * count > steps.total() else None
 
 
 def list_picture_files(path: Path) -> list[Path] | None:

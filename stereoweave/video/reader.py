@@ -25,7 +25,7 @@ from stereoweave.pictures.panoramas import SphereView, choose_layout, guess_proj
 from stereoweave.video.frame_sequence import FrameSequence
 from stereoweave.video.mvc import check_not_mvc
 from stereoweave.video.packings import FRAME_PACKINGS, FRAME_SEQUENTIAL, TWO_STREAMS
-from stereoweave.video.picture_track import PictureTrack, check_numbers, list_picture_files
+from stereoweave.video.picture_track import PictureTrack, list_picture_files, note_numbers
 from stereoweave.video.times import format_frame_time
 from stereoweave.video.track_frame import TrackFrame
 from stereoweave.video.tracks import Track, VideoTrack, open_track
@@ -56,8 +56,8 @@ class StereoFrame(NamedTuple):
     Attributes:
         left, right: uint8 RGB [H, W, 3].
         time: Exact time since the start of the video, in seconds.
-        problem: Description of damage to this frame, of a changed timestamp, or of an early end of the
-            video; None if there is no problem.
+        problem: Description of damage to this frame, of a changed timestamp, of two frames that are apart,
+            or of an early end of the video; None if there is no problem.
         fine: Function that returns left and right with all their bits and in the file's own colours, HDR too,
             float32 RGB from 0 to 255; None unless the video reads them.
     """
@@ -317,7 +317,10 @@ def open_video(
         return _show_window(_open_single(paths[0], format, rate, sphere), sphere)
     left, right = (open_track(path, rate) for path in paths)
     _check_alike(left, right)
-    return _show_window(StereoVideo([left, right], None), sphere)
+    notes: list[Note] = []
+    if isinstance(left, PictureTrack) and isinstance(right, PictureTrack):
+        notes = note_numbers(left, right)
+    return _show_window(StereoVideo([left, right], None, notes), sphere)
 
 
 def _open_single(path: Path, format: str | None, rate: Fraction | None, sphere: SphereRequest) -> StereoVideo:
@@ -432,8 +435,6 @@ def _check_alike(left: Track, right: Track) -> None:
             f"{float(ends_s[0]):.3f} s in {left.name} and at {float(ends_s[1]):.3f} s in {right.name}; "
             "convert one of them first"
         )
-    if isinstance(left, PictureTrack) and isinstance(right, PictureTrack):
-        check_numbers(left, right)
 
 
 def _bridge_gaps(track: _Source, start: int, first: int) -> Iterator[tuple[TrackFrame, str | None]]:

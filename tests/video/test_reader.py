@@ -383,17 +383,32 @@ def test_frames_of_two_videos_that_are_apart_are_reported(tmp_path):
     assert problems(open_video(paths)) == dict.fromkeys((2, 3, 4), apart)
 
 
-def test_two_series_of_pictures_that_miss_different_numbers_are_refused(tmp_path):
-    pairs = example_pairs(4)
+def test_a_gap_in_one_of_two_numbered_series_is_noted(tmp_path):
+    pairs = example_pairs(6)
     write_pictures(tmp_path, "left_{}.png", [left for left, _ in pairs])
     write_pictures(tmp_path, "right_{}.png", [right for _, right in pairs])
     patterns = [tmp_path / "left_*.png", tmp_path / "right_*.png"]
-    assert open_video(patterns).frame_count == 4
+    assert open_video(patterns).notes == ()
     (tmp_path / "left_9.png").unlink()
     (tmp_path / "right_10.png").unlink()
-    assert "expected pictures of the same numbers, found left_10.png beside right_9.png; " in refusal(
-        *patterns
-    )
+    assert [str(note) for note in open_video(patterns).notes] == [
+        "left_10.png is paired with right_9.png: a picture seems to be missing in one of the sequences; add "
+        "the missing picture, or remove its counterpart"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("lefts", "rights"),
+    [((0, 3, 5, 12), (1, 3, 6, 12)), ((1, 2, 3, 4), (101, 102, 103, 104)), ((1, 3, 5, 7), (2, 4, 6, 9))],
+)
+def test_series_with_other_numbers_are_paired_without_a_note(tmp_path, lefts, rights):
+    """Times, another beginning, and pictures of a series that were deleted afterwards."""
+    for eye, numbers in (("left", lefts), ("right", rights)):
+        for number, picture in zip(numbers, example_pairs(4), strict=True):
+            write_image(tmp_path / f"{eye}_{number}.png", picture[eye == "right"])
+    found = open_video([tmp_path / "left_*.png", tmp_path / "right_*.png"])
+    assert found.frame_count == 4
+    assert (found.notes == ()) == (rights[-1] != 9)
 
 
 def test_a_damaged_frame_is_reported_with_the_name_of_its_video(tmp_path):
