@@ -23,7 +23,7 @@ from stereoweave.stereo import StereoPair
 _MM_ABOVE = 2.0
 _YES, _NO = ("true", "yes", "on", "y"), ("false", "no", "off", "n")
 # Rectified pictures may be off-centre, but their principal point is within this share of their sides.
-_OFF_CENTRE = 0.25
+_OFF_CENTRE = 0.2
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 _FISHEYE_NAMES = {"fisheye", "equidistant", "equi", "kannalabrandt", "kb4"}
 _PINHOLE_NAMES = {"pinhole", "radtan", "plumbbob", "rationalpolynomial", "brownconrady", "none"}

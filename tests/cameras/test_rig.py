@@ -196,8 +196,9 @@ def test_kittis_colour_cameras_are_read_from_calib_txt(tmp_path):
 
 def test_a_calibration_without_a_size_is_doubted_if_its_centre_is_far_from_the_pictures(tmp_path):
     path = stored(tmp_path, KITTI)
-    fitting, halved = (read_rig(path, size_px).notes for size_px in ((1242, 375), (621, 188)))
-    assert len(fitting) == 1
+    sizes_px = (1242, 375), (621, 188), (2484, 750)
+    fitting, halved, doubled = (read_rig(path, size_px).notes for size_px in sizes_px)
+    assert (len(fitting), len(doubled)) == (1, 2)
     assert halved[:-1] == fitting
     assert str(halved[-1]) == (
         "the calibration seems to be for pictures of another size: its principal point, 600, 170, is far "
