@@ -217,8 +217,7 @@ def measure(  # noqa: PLR0913 - each is an option of the command line
     """Measure the distance in metres between two points.
 
     The points are pixels of the left picture or, with --rectify, of matched_left.png as depth --rectify
-    writes it; to measure in the cropped pictures that rectify writes, give those with their calib.yml. The
-    uncertainty of the distance is reported too.
+    writes it. Give the cropped pictures of rectify with their calib.yml. The uncertainty is reported too.
     """
     from stereoweave.cameras.diagnosis import find_problems
     from stereoweave.matching.backend import Backend

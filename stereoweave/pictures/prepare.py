@@ -66,9 +66,9 @@ class Prepared:
     """A pair ready for matching, its picture files, and notes on what was detected or changed.
 
     `alignment` is the alignment of the pair, if it has been measured. `remedy` is what to do if rows are
-    apart nevertheless. `is_new` says whether the left picture is in no file: the pair was rectified, swapped
-    or turned by one picture's orientation, or its file holds both views. `sphere` is the window of a VR180 or
-    360-degree picture, and `baseline_m` the distance of its eyes, if known.
+    apart nevertheless. `is_new` says whether the left picture may be in no file: the pair was rectified or
+    swapped, one picture was turned as the other, or its file holds both views. `sphere` is the window of a
+    VR180 or 360-degree picture, and `baseline_m` the distance of its eyes, if known.
     """
 
     pair: StereoPair
@@ -158,7 +158,7 @@ def _prepare_window(pictures: Sequence[Path], opened: Opened, request: Request) 
 
 
 def _is_new(pictures: Sequence[Path], opened: Opened, ready: StereoPair) -> bool:
-    """Return whether the left picture to match is in no file (see `Prepared`)."""
+    """Return whether the left picture to match may be in no file (see `Prepared`)."""
     return len(pictures) == 1 or opened.turned_alike or ready.left is not opened.pair.left
 
 
