@@ -134,7 +134,7 @@ def require_extra(extra: str, what: str) -> Iterator[None]:
     except ModuleNotFoundError as missing:
         raise StereoweaveError(
             f"{what}, but the module {missing.name} is not installed; install the extra '{extra}' from your "
-            f"wheel or your copy of the source: pip install 'stereoweave[{extra}]'"
+            f'wheel or your copy of the source: pip install "stereoweave[{extra}]"'
         ) from missing
 
 

@@ -191,5 +191,5 @@ def test_a_plot_without_matplotlib_names_the_extra(tmp_path):
     assert done.returncode == 2
     (line,) = done.stderr.splitlines()
     assert "a plot needs matplotlib, but the module matplotlib.axes is not installed" in line
-    assert "pip install 'stereoweave[train]'" in line
+    assert 'pip install "stereoweave[train]"' in line
     assert list(tmp_path.iterdir()) == []

@@ -475,7 +475,7 @@ def test_training_without_pytorch_names_the_extra(tmp_path):
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
     assert "PyTorch" in done.stderr
-    assert "from your wheel or your copy of the source: pip install 'stereoweave[train]'" in done.stderr
+    assert 'from your wheel or your copy of the source: pip install "stereoweave[train]"' in done.stderr
     assert list(tmp_path.iterdir()) == []
 
 

@@ -396,7 +396,7 @@ def test_without_pillow_heif_the_error_names_the_extra(tmp_path, pair, monkeypat
         assert refusal_of(function, path) == (
             f"{path}: expected a picture, found HEIC, which needs pillow-heif, but the module pillow_heif is "
             "not installed; install the extra 'heic' from your wheel or your copy of the source: "
-            "pip install 'stereoweave[heic]'"
+            'pip install "stereoweave[heic]"'
         )
 
 

@@ -121,7 +121,7 @@ def test_without_rawpy_the_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rawpy", None)
     message = refusal(path)
     assert "found a camera raw file, which needs rawpy, but the module rawpy is not installed" in message
-    assert message.endswith("pip install 'stereoweave[raw]'")
+    assert message.endswith('pip install "stereoweave[raw]"')
 
 
 # Damaged and odd files

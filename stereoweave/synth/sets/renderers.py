@@ -29,7 +29,7 @@ def choose_renderer(effects: Effects) -> SceneRenderer:
     except ImportError as error:
         raise StereoweaveError(
             f"rendering: expected OpenGL (EGL) or embree, found neither ({without_opengl}; {error}); "
-            f"run pip install 'stereoweave[synth]', and {_PACKAGES}"
+            f'run pip install "stereoweave[synth]", and {_PACKAGES}'
         ) from error
     warnings.warn(
         f"rendering with embree, which is slower and plainer, because OpenGL did not start: {without_opengl}",

@@ -109,7 +109,7 @@ def test_without_either_renderer_the_error_names_the_packages_to_install(monkeyp
     monkeypatch.setitem(sys.modules, "moderngl", None)
     monkeypatch.setitem(sys.modules, "embreex.rtcore_scene", None)
     with pytest.raises(
-        StereoweaveError, match=r"pip install 'stereoweave\[synth\]'.*libgl1-mesa-dri"
+        StereoweaveError, match=r'pip install "stereoweave\[synth\]".*libgl1-mesa-dri'
     ) as raised:
         choose_renderer(PLAIN)
     assert "\n" not in str(raised.value)
