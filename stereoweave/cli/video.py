@@ -82,7 +82,10 @@ Position = Annotated[
 ]
 Layout = Annotated[
     str | None,
-    typer.Option(help="Write a layout of `stereoweave view`, such as anaglyph_dubois or quilt."),
+    typer.Option(
+        help="Write a layout of `stereoweave view`, such as anaglyph_dubois or quilt, but not sweep, wiggle "
+        "or viewer."
+    ),
 ]
 Bits = Annotated[
     int,
