@@ -79,11 +79,12 @@ def _train(recipe: Recipe, out: Path, console: Console) -> Path:
         for step, batch in _load_batches(batches, run.start.step):
             loss = run.step(step, batch, batches)
             rate = recipe.batch / (time.perf_counter() - began)
-            run.save_periodically(step + 1, last)
             if (step + 1) % recipe.validate_every == 0 or step + 1 == recipe.steps:
                 if run.fabric.is_global_zero:
                     _validate(run, step + 1, held_out, last, console)
                 run.fabric.barrier()
+            else:  # a checkpoint before the validation would let a killed run resume without it
+                run.save_periodically(step + 1, last)
             bar.update(task, completed=step + 1, loss=f"loss {loss:.4g}", rate=f"{rate:.1f} pairs/s")
             began = time.perf_counter()
     return last

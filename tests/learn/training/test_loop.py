@@ -44,6 +44,7 @@ from stereoweave.learn.models import MODELS
 from stereoweave.learn.recipe import read_recipe
 from stereoweave.learn.training import fabric
 from stereoweave.learn.training import loop as training
+from stereoweave.learn.training import run as training_run
 from stereoweave.learn.training.fabric import make_fabric
 from stereoweave.learn.training.loop import train
 from stereoweave.learn.training.run import TrainingRun, load_start
@@ -181,6 +182,28 @@ def test_a_run_is_saved_every_ten_minutes(folder, recipe_file, tmp_path, logger,
     assert checkpoint.load(last).step == 3
     run.save_periodically(4, last)
     assert checkpoint.load(last).step == 3
+
+
+def test_a_run_that_is_stopped_in_a_validation_validates_when_it_resumes(
+    folder, in_place, tmp_path, monkeypatch, finished
+):
+    (tmp_path / "pairs").symlink_to(folder / "pairs")
+    validate = training._validate
+
+    def stop(*_given):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(training, "_validate", stop)
+    monkeypatch.setattr(training_run, "_SAVE_EVERY_S", 0)
+    with pytest.raises(KeyboardInterrupt):
+        training.train_recipe(RECIPE, tmp_path / "stopped", QUIET)
+    monkeypatch.setattr(training, "_validate", validate)
+    last = training.train_recipe(RECIPE, tmp_path / "stopped", QUIET)
+    whole = checkpoint.load(finished)
+    assert checkpoint.load(last).scores.keys() == whole.scores.keys()
+    assert [row["step"] for row in training.read_scores(last.with_name("validation.csv"))] == [
+        row["step"] for row in training.read_scores(finished.with_name("validation.csv"))
+    ]
 
 
 def test_a_run_is_scored_by_class_on_the_held_out_sets_of_its_recipe(folder, in_place, tmp_path):
