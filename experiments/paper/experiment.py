@@ -17,6 +17,7 @@ from stereoweave.learn.recipe import COLLAGE, Recipe
 from stereoweave.learn.training.loop import train_recipe
 from stereoweave.learn.training.objective import fit_recipe
 from stereoweave.synth.sets.workers import count_step, run_in_workers
+from stereoweave.system.threads import usable_cores
 
 
 def plan(base: Recipe, runs: Path, extent: Extent, console: Console) -> list[Trial]:
@@ -95,7 +96,7 @@ def _train_all(
 
 
 def _train(runs: Path, jobs: int, scored: bool, recipe: Recipe) -> str:
-    torch.set_num_threads(max(1, torch.get_num_threads() // jobs))
+    torch.set_num_threads(max(1, usable_cores() // jobs))
     train_recipe(recipe, runs / recipe.name, Console(quiet=True))
     if scored:
         score_training(runs / recipe.name, runs / "pairs")
