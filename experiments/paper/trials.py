@@ -82,7 +82,7 @@ def list_trials(base: Recipe, extent: Extent, fitted_exponent: float) -> list[Tr
         *_repeat(seeds, base, DECODER, {"step-wise, no skips": {"model": "fast_depth_without_skips"}}),
         *_repeat(seeds, base, LOSS, {"l2": {}, **{loss: {"loss": loss} for loss in _other_losses(base)}}),
         *(_list_transfer(base) if base.dataset == COLLAGE else ()),
-        *_repeat(1, base, ITERATIONS, {f"{steps} steps": {"steps": steps} for steps in FIGURE_3_STEPS}),
+        *_list_iterations(base),
         *_repeat(1, base, NETWORKS, {"dispnet": rivals["dispnet"]}),
     ]
     return [trial for trial in trials if trial.claim in extent.claims]
@@ -105,6 +105,15 @@ def _repeat(seeds: int, base: Recipe, claim: str, settings: dict[str, dict[str, 
     for setting, changes in settings.items():
         for seed in range(base.seed, base.seed + seeds):
             yield Trial(claim=claim, setting=setting, recipe=_with_name(replace(base, seed=seed, **changes)))
+
+
+def _list_iterations(base: Recipe) -> Iterator[Trial]:
+    """Yield the first steps of the base, whose learning rate does not fall yet."""
+    # The number of steps alone is the name of a whole training, with its decay.
+    suffix = "-begun" if base.cool_down_steps else ""
+    settings = {f"{steps} steps": {"steps": steps, "cool_down_steps": 0} for steps in FIGURE_3_STEPS}
+    for trial in _repeat(1, base, ITERATIONS, settings):
+        yield replace(trial, recipe=replace(trial.recipe, name=trial.recipe.name + suffix))
 
 
 def _list_transfer(base: Recipe) -> Iterator[Trial]:

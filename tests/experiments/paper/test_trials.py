@@ -115,6 +115,18 @@ def test_slow_networks_and_those_beside_them_take_the_steps_that_are_asked_for()
     assert lengths == {(NETWORKS, 600, 200), (NETWORKS_SHORT, 300, 100)}
 
 
+def test_the_steps_of_figure_3_are_the_first_ones_of_the_whole_training():
+    base = replace(BASE, cool_down_steps=200)
+    planned = list_trials(base, Extent(seeds=1, slow_steps=250), 1.37)
+    begun = [trial.recipe for trial in planned if trial.claim == ITERATIONS]
+    assert [recipe.steps for recipe in begun] == [10, 50, 250]
+    for recipe in begun:
+        rates = [recipe.learning_rate_at(step) for step in range(recipe.steps)]
+        assert rates == [base.learning_rate_at(step) for step in range(recipe.steps)]
+    names = {trial.recipe: trial.recipe.name for trial in planned}
+    assert len(set(names.values())) == len(names)  # 250 steps with a decay are another training
+
+
 def test_the_papers_recipe_is_trained_once_for_five_claims():
     claims = [trial.claim for trial in list_trials(BASE, ONCE, 1.37) if trial.recipe.name == FIRST]
     assert claims == [PROJECTION, NETWORKS, ADJUSTMENT, DECODER, LOSS]
