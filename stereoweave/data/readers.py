@@ -12,6 +12,7 @@ from stereoweave.arguments import check_choice
 from stereoweave.cameras.calibration_files import add_camera
 from stereoweave.data import eth3d, kitti, middlebury, paper_layout, scene_flow, shards, sintel
 from stereoweave.data.frames import Frame, require_folder
+from stereoweave.data.samples import find_occluded
 from stereoweave.data.splits import split_frames
 from stereoweave.errors import FormatError, Remedy, StereoweaveError
 from stereoweave.io.images import read_pair
@@ -62,7 +63,7 @@ class Scene:
         name: Name of the folder or frame.
         pair: The pair, with its camera if known.
         truth_px: float32 [H, W], true disparity of the left view; NaN where unknown.
-        occluded: True occlusion mask of the left view; None if the right view's disparity is unknown.
+        occluded: True occlusion mask of the left view; None if there is neither one nor right disparity.
     """
 
     name: str
@@ -110,7 +111,10 @@ def list_scenes(folder: str | Path, dataset: str | None = None) -> list[Callable
 def _read_frame(frame: Frame) -> Scene:
     sample = frame.read()
     pair = StereoPair(left=sample.left, right=sample.right, camera=sample.camera)
-    occluded = sample.occluded if np.isfinite(sample.right_disparity_px).any() else None
+    # Without right truth, only pixels outside the right picture are found; more are from the dataset's mask.
+    found = find_occluded(sample.disparity_px, sample.right_disparity_px)
+    known = np.isfinite(sample.right_disparity_px).any() or not np.array_equal(sample.occluded, found)
+    occluded = sample.occluded if known else None
     return Scene(name=frame.name, pair=pair, truth_px=sample.disparity_px, occluded=occluded)
 
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from dataset_examples import cut, error_naming, names, read_frame, shades, write_map, write_picture
 
+from stereoweave.data.readers import read_scenes
 from stereoweave.stereo import StereoCamera
 
 # Rounded values of a real drive; the colour cameras are beside the grey ones.
@@ -62,6 +63,8 @@ def test_pixels_known_only_in_the_occluded_map_are_occluded(dataset, tmp_path):
     sample = read_frame(dataset, tmp_path, "000001_10")
     assert np.argwhere(sample.occluded).tolist() == [[0, 1]]
     assert not sample.right_occluded.any()
+    _, scene = read_scenes(tmp_path, dataset)
+    assert np.argwhere(scene.occluded).tolist() == [[0, 1]]
 
 
 def test_the_disparity_of_the_next_moment_is_not_taken_for_the_right_view_s(tmp_path):
