@@ -105,6 +105,7 @@ class Recipe:
         robust: Share of the logarithm in WeaveNet's regression loss, which reduces the effect of large
             errors.
         steadiness: Weight of WeaveNet's loss on upsampling logits that amplify rounding errors.
+        steadiness_share: Share of the micro-batches that have this loss, which more than doubles their time.
         teacher: Checkpoint of a trained WeaveNet, whose results are targets beside the ground truth; empty
             for none.
         taught: Weight of the losses between the network's results and the teacher's.
@@ -152,6 +153,7 @@ class Recipe:
     distribution: NonNegative = 1.0
     robust: Share = 0.0
     steadiness: NonNegative = 0.0
+    steadiness_share: Share = 1.0
     teacher: Text = ""
     taught: NonNegative = 0.5
     trained: Parts = ()

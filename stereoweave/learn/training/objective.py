@@ -172,9 +172,13 @@ class WeaveObjective:
     def predict(self, network: WeaveNet, batch: Batch) -> WeavePrediction:
         views = batch["left"], batch["right"]
         lesson = self.teacher.teach(*views) if self.teacher else None
-        if self.recipe.steadiness:
+        if not self.recipe.steadiness:
+            return WeavePrediction(network.stages(*views), lesson=lesson)
+        share = self.recipe.steadiness_share
+        if share == 1 or torch.rand(()) < share:
             return WeavePrediction(*predict_with_amplification(network, *views), lesson)
-        return WeavePrediction(network.stages(*views), lesson=lesson)
+        # All micro-batches of a step have the same terms.
+        return WeavePrediction(network.stages(*views), batch["left"].new_zeros(()), lesson)
 
     def losses(self, predicted: WeavePrediction, batch: Batch) -> dict[str, Tensor]:
         stages, recipe = predicted.stages, self.recipe

@@ -75,20 +75,31 @@ def test_batch_norms_record_one_pass(name):
         assert torch.equal(found, expected)
 
 
-def test_the_loss_of_a_recipe_has_the_amplification_only_if_it_asks_for_it():
-    network = untrained("weave_small")
+def known_batch():
     left, right = views()
-    batch = {
-        "left": left,
-        "right": right,
-        "disparity_px": torch.full((2, 1, 64, 96), 5.0),
-        "occluded": torch.zeros(2, 1, 64, 96, dtype=torch.bool),
-    }
+    truth_px = torch.full((2, 1, 64, 96), 5.0)
+    return {"left": left, "right": right, "disparity_px": truth_px, "occluded": truth_px < 0}
+
+
+def test_the_loss_of_a_recipe_has_the_amplification_only_if_it_asks_for_it():
+    network, batch = untrained("weave_small"), known_batch()
     plain = WeaveObjective(RECIPE)
     assert "steadiness" not in plain.losses(plain.predict(network, batch), batch)
     steady = WeaveObjective(replace(RECIPE, steadiness=0.25))
     predicted = steady.predict(network, batch)
     assert steady.losses(predicted, batch)["steadiness"] == 0.25 * predicted.amplification
+
+
+def test_a_share_of_the_micro_batches_has_the_loss():
+    network, batch = untrained("weave_small"), known_batch()
+    nn.init.constant_(network.refinement.weights.weight, 1000.0)
+    objective = WeaveObjective(replace(RECIPE, steadiness=0.25, steadiness_share=0.3))
+    found = []
+    for seed in range(20):
+        torch.manual_seed(seed)
+        found.append(objective.losses(objective.predict(network, batch), batch))
+    assert 1 <= sum(losses["steadiness"] > 0 for losses in found) <= 12  # 6 in the mean
+    assert len({tuple(losses) for losses in found}) == 1
 
 
 def test_training_lowers_the_amplification():
