@@ -176,7 +176,7 @@ def test_an_mp4_without_pyav_names_the_extra_before_a_frame_is_rendered(tmp_path
         raise AssertionError
         yield
 
-    with pytest.raises(StereoweaveError, match=r"an MP4 file needs PyAV, .*'stereoweave\[video\]'"):
+    with pytest.raises(StereoweaveError, match=r'an MP4 file needs PyAV, .*"stereoweave\[video\]"'):
         write_animation(tmp_path / "a.mp4", never(), 40)
     assert list(tmp_path.iterdir()) == []
     assert check_animation_ending("a.gif") == ".gif"
