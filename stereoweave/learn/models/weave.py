@@ -370,12 +370,12 @@ class WeaveNet(nn.Module):
     def stages(self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]) -> WeaveStages:
         """Return the results of every stage for both views."""
         coarse = self.estimate_coarse(left, right)
-        disparity_px, confidence_logit, logits = self.refine_both(coarse, self.refinements[-1])
+        fine, confidence_logit, logits = self.refine_both(coarse, self.refinements[-1])
         return WeaveStages(
             correlation=coarse.correlation,
             scores=coarse.scores,
             coarse_px=coarse.disparity * 2,
-            disparity_px=disparity_px,
+            disparity_px=self.upsample(fine * 2, logits),
             confidence_logit=confidence_logit,
             upsampling_logits=(*coarse.upsampling_logits, logits),
         )
@@ -395,7 +395,7 @@ class WeaveNet(nn.Module):
         return CoarseStages(
             correlation=correlation,
             scores=scores,
-            disparity=self.upsample(spread * 2, logits),
+            disparity=self.upsample_coarse(spread * 2, logits),
             context=maps.half,
             match=self.to_match_half(maps.half),
             handed=F.pixel_shuffle(self.to_half(decoded), 2),
@@ -403,7 +403,7 @@ class WeaveNet(nn.Module):
         )
 
     def refine_both(self, coarse: CoarseStages, refinement: Refinement) -> tuple[Tensor, Tensor, Tensor]:
-        """Return both views' disparities in pixels, their confidence logits, and the upsampling's logits."""
+        """Return what `_refine` returns, for both views."""
         batch = coarse.match.shape[0] // 2
         context, match = as_left_view(coarse.context, batch), as_matched_pixels(coarse.match, batch)
         return self._refine(refinement, coarse.disparity, match, context, coarse.handed)
@@ -416,13 +416,13 @@ class WeaveNet(nn.Module):
         context: Tensor,
         handed: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return what `refine_both` returns, for the views whose maps are given.
+        """Return disparities in half-resolution pixels, confidence logits and upsampling logits.
 
-        `match` holds the features of these views and of the other ones, each [B, H/2, W/2, C].
+        They are of the views whose maps are given. `match` holds the features of these views and of the other
+        ones, each [B, H/2, W/2, C].
         """
         fine, logits, confidence = refinement(disparity, *match, context, handed)
-        logits = logits.float()
-        return self.upsample(fine * 2, logits), confidence.float(), logits
+        return fine, confidence.float(), logits.float()
 
     def match(self, maps: WeaveFeatures, first: WeaveFeatures) -> tuple[Tensor, Tensor, Tensor]:
         """Return the matching scores before and after aggregation, and the decoder's features.
@@ -439,6 +439,10 @@ class WeaveNet(nn.Module):
     def upsample(self, x: Tensor, weights: Tensor) -> Tensor:
         """Upsample `x` by two with `weights`; edges are sharper at inference, when no gradient is needed."""
         return upsample_convex(x, weights) if self.training else upsample_to_a_side(x, weights)
+
+    def upsample_coarse(self, x: Tensor, weights: Tensor) -> Tensor:
+        """Upsample what the last refinement refines; subclasses may do it in another way than `upsample`."""
+        return self.upsample(x, weights)
 
     def read_disparity(self, scores: Tensor, decoded: Tensor) -> Tensor:
         """Return the disparity in quarter-resolution pixels; subclasses may also use `decoded`."""
@@ -463,13 +467,14 @@ class WeaveNet(nn.Module):
         """
         coarse, batch = self.estimate_coarse(left, right), left.shape[0]
         match = coarse.match.permute(0, 2, 3, 1)
-        left_px, confidence_logit, _ = self._refine(
+        fine, confidence_logit, logits = self._refine(
             self.refinements[-1],
             coarse.disparity[:batch],
             (match[:batch], match[batch:]),
             coarse.context[:batch],
             coarse.handed[:batch],
         )
+        left_px = self.upsample(fine * 2, logits)
         right_px = mirror(F.interpolate(coarse.disparity[batch:] * 2, scale_factor=2.0))
         # Noise at infinity has both signs, but parallel cameras have no negative disparities.
         return left_px.clamp(min=0), right_px.clamp(min=0), confidence_logit

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from stereoweave.learn.models.layers import Halve, mean_around
+from stereoweave.learn.models.layers import Halve, mean_around, upsample_convex
 from stereoweave.learn.models.weave import (
     BASE_GROWN,
     SMALL,
@@ -94,16 +94,24 @@ class WeaveHalfNet(WeaveNet):
         confidence for the halved images has no loss of its own.
         """
         inner = super().estimate_coarse(_halve(left), _halve(right))
-        disparity, confidence_logit, logits = self.refine_both(inner, self.refinement)
+        fine, confidence_logit, logits = self.refine_both(inner, self.refinement)
         stem = self.stem(torch.cat([left, right]) * 2 - 1)
         return replace(
             inner,
-            disparity=disparity,
+            disparity=self.upsample_coarse(fine * 2, logits),
             context=stem,
             match=self.to_match_stem(stem),
             handed=confidence_logit,
             upsampling_logits=(*inner.upsampling_logits, logits),
         )
+
+    def upsample_coarse(self, x: Tensor, weights: Tensor) -> Tensor:
+        """Upsample `x` by two with `weights`; surfaces are mixed at inference, too.
+
+        Selecting one of them would amplify rounding errors twice as much, and later upsamplings amplify them
+        again.
+        """
+        return upsample_convex(x, weights)
 
 
 def _halve(image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h2 w2"]:

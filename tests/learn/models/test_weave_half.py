@@ -27,8 +27,8 @@ def test_the_whole_graph_of_both_views_takes_no_more_multiply_adds_than_promised
 
 
 def test_before_the_last_refinement_the_results_are_those_of_a_weavenet_for_the_halved_images():
-    network = untrained("weave_half")
-    inner = WeaveNet(HALF).eval()
+    # In training, because at inference each network selects surfaces in its own last upsampling alone.
+    network, inner = untrained("weave_half").train(), WeaveNet(HALF).train()
     inner.load_state_dict({name: network.state_dict()[name] for name in inner.state_dict()})
     pair = random_pair(2, 64, 96)
     with torch.no_grad():
@@ -63,3 +63,11 @@ def test_the_network_overfits_one_pair():
     trained = overfitted("weave_half")
     assert trained.error_after_px < 1
     assert trained.error_after_px < trained.error_before_px / 5
+
+
+def test_only_the_last_upsampling_selects_a_surface_at_inference():
+    network = untrained("weave_half").eval()
+    # The corner of three pixels at 10 px and one at 50 px, with equal weights.
+    surfaces, logits = torch.tensor([[10.0, 10.0], [10.0, 50.0]]).view(1, 1, 2, 2), torch.zeros(1, 16, 2, 2)
+    assert network.upsample_coarse(surfaces, logits)[0, 0, 1, 1].item() == pytest.approx(20, abs=0.01)
+    assert network.upsample(surfaces, logits)[0, 0, 1, 1].item() == pytest.approx(10, abs=0.01)
