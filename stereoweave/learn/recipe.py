@@ -104,7 +104,7 @@ class Recipe:
         distribution: Weight of WeaveNet's cross-entropy over disparity levels; 0 for regression only.
         robust: Share of the logarithm in WeaveNet's regression loss, which reduces the effect of large
             errors.
-        steadiness: Weight of WeaveNet's loss on upsampling logits that amplify rounding errors.
+        steadiness: Weight of WeaveNet's loss on upsamplings that amplify rounding errors.
         steadiness_share: Share of the micro-batches that have this loss, which more than doubles their time.
         teacher: Checkpoint of a trained WeaveNet, whose results are targets beside the ground truth; empty
             for none.

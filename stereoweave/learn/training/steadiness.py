@@ -1,7 +1,7 @@
-"""How much WeaveNet's upsampling logits amplify small changes of their inputs.
+"""How much WeaveNet's upsamplings amplify small changes of their inputs.
 
-Two runtimes round differently. Where a logit amplifies the difference at a depth edge, a single pixel may get
-disparities that differ by much more than the rounding.
+Two runtimes round differently. Where a pixel at a depth edge lies between two surfaces, its disparity changes
+by the step between them times the change of its weights, which may be much more than the rounding.
 """
 
 from collections.abc import Iterator, Sequence
@@ -12,24 +12,26 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from stereoweave.learn.models.layers import upsample_convex
 from stereoweave.learn.models.weave import Refinement, WeaveNet, WeaveStages
 
 # Disturbance of the disparity before a refinement, in pixels of its maps, and of the disparity (in
 # levels) and the features after the aggregation: far above float32's rounding, and too small to move a match.
 _COARSE_DISTURBANCE_PX, _QUARTER_DISTURBANCE = 0.05, 0.01
-# Logits may change by this much per unit of the disturbance.
-_LARGEST_AMPLIFICATION = 1.0
+# An upsampled disparity may change by this much per unit of the disturbance. Each of a network's two or three
+# upsamplings amplifies what the one before it has amplified.
+_LARGEST_AMPLIFICATION = 2.0
 
 
 def predict_with_amplification(
     network: WeaveNet, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
 ) -> tuple[WeaveStages, Float[Tensor, ""]]:
-    """Return the results of every stage, and the mean squared excess of the logits' slopes over 1.
+    """Return the results of every stage, and the mean excess of the upsamplings' slopes over 2.
 
-    A slope is a logit's change, divided by the disturbance of the disparity before a refinement, and for the
-    first upsampling of what leaves the aggregation. The excess is summed over all upsamplings. It is computed
-    in float32, since bfloat16 would round the changes away. The logits of the first upsampling count only if
-    the network has a completion.
+    A slope is the change of an upsampled disparity, divided by the disturbance of the disparity before a
+    refinement, and for the first upsampling of what leaves the aggregation; all in pixels of the same size.
+    The excess is summed over all upsamplings. It is computed in float32, since bfloat16 would round the
+    changes away. The first upsampling counts only if the network has a completion.
     """
     watched = [*network.refinements, *([network.completion] if network.completion is not None else [])]
     with _record_inputs(watched) as inputs:
@@ -74,28 +76,28 @@ def _keep_statistics(network: nn.Module) -> Iterator[None]:
 
 
 def _measure_fine(refinement: Refinement, disparity: Tensor, *others: Tensor) -> Tensor:
-    def compute_logits(disparity: Tensor) -> Tensor:
-        _, logits, _ = refinement(disparity, *others)
-        return logits
+    def upsample(disparity: Tensor) -> Tensor:
+        fine, logits, _ = refinement(disparity, *others)
+        return upsample_convex(fine, logits)
 
     moved = disparity + _COARSE_DISTURBANCE_PX * torch.randn_like(disparity).sign()
-    return _mean_excess((compute_logits(moved) - compute_logits(disparity)) / _COARSE_DISTURBANCE_PX)
+    return _mean_excess((upsample(moved) - upsample(disparity)) / _COARSE_DISTURBANCE_PX)
 
 
 def _measure_coarse(
     network: WeaveNet, disparity: Tensor, other: Tensor, quarter: Tensor, decoded: Tensor
 ) -> Tensor:
-    def compute_logits(disparity: Tensor, other: Tensor, decoded: Tensor) -> Tensor:
+    def upsample(disparity: Tensor, other: Tensor, decoded: Tensor) -> Tensor:
         assert network.completion is not None
         spread, features = network.completion(disparity, other, quarter, decoded)
         if network.propagation is not None:
-            _, features = network.propagation(spread, quarter, features)
-        return network.weights(features)
+            spread, features = network.propagation(spread, quarter, features)
+        return upsample_convex(spread, network.weights(features))
 
     before = (disparity, other, decoded)
     after = (x + _QUARTER_DISTURBANCE * torch.randn_like(x) for x in before)
-    return _mean_excess((compute_logits(*after) - compute_logits(*before)) / _QUARTER_DISTURBANCE)
+    return _mean_excess((upsample(*after) - upsample(*before)) / _QUARTER_DISTURBANCE)
 
 
 def _mean_excess(slope: Tensor) -> Tensor:
-    return (slope.abs() - _LARGEST_AMPLIFICATION).clamp(min=0).square().mean()
+    return (slope.abs() - _LARGEST_AMPLIFICATION).clamp(min=0).mean()
