@@ -25,7 +25,10 @@ _NUMBER = re.compile(r"%(?:0?([0-9]+))?d")
 
 
 class PictureTrack:
-    """Frames of a series of pictures, with the attributes of a `VideoTrack`.
+    """Frames of a series of pictures, with the attributes of a `VideoTrack` and one more.
+
+    Attributes:
+        files: The picture of each frame, in order.
 
     Raises:
         FormatError: No picture in `files` can be read.
