@@ -89,6 +89,7 @@ class Recipe:
         crop_size: Height and width of the crops that a step trains on.
         augment: Also scale, mirror and recolour crops.
         offset_share: Share of pairs whose right crop is shifted to the right, which increases disparity.
+        padded_share: Share of crops that end in padding, as pictures of other sizes do at inference.
         validation_pairs: Number of pairs to validate on: collages with another seed, or held-out frames.
         held_out: Further validation sets, each with its name and its folder of rendered pairs.
         validate_every: Steps between validations; each validation is followed by a checkpoint.
@@ -139,6 +140,7 @@ class Recipe:
     crop_size: Size = (256, 384)
     augment: Switch = True
     offset_share: Share = 0.0
+    padded_share: Share = 0.0
     validation_pairs: Count = 64
     held_out: Folders = ()
     validate_every: Count = 500

@@ -58,6 +58,38 @@ def augment(
     return replace(sample, left=left, right=right)
 
 
+# Most rows and columns that `pad` replaces, as a share of all.
+_MOST_PADDING = 0.25
+
+
+def pad(sample: Sample, rng: np.random.Generator) -> Sample:
+    """Replace up to a quarter of the rows, at the bottom, and columns, on the right, by padding.
+
+    As in `Matcher`, padding repeats the last row and column that remain. Its disparity is unknown, and pixels
+    of the right view that show what is only in the replaced part of the left one are occluded.
+    """
+    rows, columns = sample.disparity_px.shape
+    height, width = (side - int(rng.integers(int(side * _MOST_PADDING) + 1)) for side in (rows, columns))
+    around = (0, rows - height), (0, columns - width)
+
+    def picture(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+        return np.pad(image[:height, :width], (*around, (0, 0)), mode="edge")
+
+    def extend(values: np.ndarray, value: float) -> np.ndarray:
+        return np.pad(values[:height, :width], around, constant_values=value)
+
+    seen_px = np.arange(columns) + np.nan_to_num(sample.right_disparity_px)
+    return replace(
+        sample,
+        left=picture(sample.left),
+        right=picture(sample.right),
+        disparity_px=extend(sample.disparity_px, np.nan),
+        right_disparity_px=extend(sample.right_disparity_px, np.nan),
+        occluded=extend(sample.occluded, False),
+        right_occluded=extend(sample.right_occluded | (seen_px > width - 1), False),
+    )
+
+
 def crop_and_scale(
     sample: Sample, height: int, width: int, rng: np.random.Generator, offset: float = 0.0
 ) -> Sample:

@@ -5,7 +5,7 @@ import torch
 from torch.utils.data import Dataset
 
 from stereoweave.errors import StereoweaveError
-from stereoweave.learn.data.augment import augment, crop
+from stereoweave.learn.data.augment import augment, crop, pad
 from stereoweave.learn.data.sources import MixedSource, OrderedSource, PairSource
 from stereoweave.learn.distributed import ProcessRank
 from stereoweave.learn.recipe import Recipe
@@ -68,7 +68,9 @@ class Batches(Dataset[dict[str, torch.Tensor]]):
         rng, size = np.random.default_rng(key), self.recipe.crop_size
         samples = (read_known(self.pairs, index) for index in indices)
         if self.recipe.augment:
-            return [augment(sample, *size, rng, self.recipe.offset_share) for sample in samples]
+            crops = [augment(sample, *size, rng, self.recipe.offset_share) for sample in samples]
+            share = self.recipe.padded_share
+            return [pad(x, rng) if share and rng.random() < share else x for x in crops]
         return [crop(sample, *size, rng) for sample in samples]
 
     def _index(self, which: int, turn: int) -> int:

@@ -12,6 +12,7 @@ from stereoweave.learn.data.augment import (
     erase_patches,
     flip_rows,
     mirror,
+    pad,
     recolour,
 )
 from stereoweave.stereo import Sample, StereoCamera
@@ -250,6 +251,34 @@ def test_a_pair_without_the_right_view_s_disparity_is_never_mirrored(sample):
 def test_a_pair_whose_right_crop_is_shifted_stays_exact(sample, seed, offset):
     part = crop_and_scale(sample, 64, 96, np.random.default_rng(seed), offset)
     assert_views_agree(part, 12)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_padding_repeats_the_last_row_and_column_whose_disparity_is_known(sample, seed):
+    padded = pad(sample, np.random.default_rng(seed))
+    known = np.isfinite(padded.disparity_px)
+    height, width = known.any(1).sum(), known.any(0).sum()
+    assert HEIGHT * 3 // 4 <= height <= HEIGHT
+    assert WIDTH * 3 // 4 <= width <= WIDTH
+    here = np.s_[:height, :width]
+    for name in ("left", "right", "disparity_px", "right_disparity_px", "occluded"):
+        assert np.array_equal(getattr(padded, name)[here], getattr(sample, name)[here])
+    for view in (padded.left, padded.right):
+        assert (view[:, width:] == view[:, width - 1 : width]).all()
+        assert (view[height:] == view[height - 1]).all()
+    for values in (padded.disparity_px, padded.right_disparity_px):
+        assert known.sum() == np.isfinite(values).sum() == np.isfinite(values[here]).sum() == height * width
+    # The right view's last columns show what the left one had in its replaced columns.
+    seen = np.arange(width) + sample.right_disparity_px[0, :width]
+    assert np.array_equal(padded.right_occluded[0, :width], seen > width - 1)
+
+
+def test_a_quarter_of_the_rows_and_columns_are_padding_at_most(sample):
+    found = [np.isfinite(pad(sample, np.random.default_rng(seed)).disparity_px) for seed in range(200)]
+    assert min(known.any(1).sum() for known in found) == HEIGHT * 3 // 4
+    assert max(known.any(1).sum() for known in found) == HEIGHT
+    assert min(known.any(0).sum() for known in found) == WIDTH * 3 // 4
+    assert max(known.any(0).sum() for known in found) == WIDTH
 
 
 def test_shifting_the_right_crop_adds_its_offset_to_the_disparity():
