@@ -110,6 +110,14 @@ def test_a_batch_depends_on_the_seed_and_the_step_alone(pairs):
     assert not torch.equal(first["left"], one[2]["left"])
 
 
+@pytest.mark.parametrize("share", [0.0, 0.3])
+def test_a_share_of_the_crops_ends_in_padding(pairs, share):
+    batches = Batches(replace(RECIPE, batch=4, padded_share=share), pairs)
+    truths_px = torch.cat([batches[step]["disparity_px"][:4, 0] for step in range(30)])
+    padded = truths_px[:, -1].isnan().all(1) | truths_px[:, :, -1].isnan().all(1)
+    assert abs(padded.float().mean() - share) < 0.1 if share else not padded.any()
+
+
 def test_a_batch_without_augmentation_holds_unchanged_crops(pairs):
     batches = Batches(replace(RECIPE, augment=False, crop_size=PAIR_SIZE), pairs)
     batch = batches[0]
