@@ -145,7 +145,7 @@ class WeavePrediction(NamedTuple):
 
     Attributes:
         stages: Results of every stage.
-        amplification: That of the upsampling logits; None if the recipe has no loss on it.
+        amplification: Mean excess of the slopes of the upsamplings; None if the recipe has no loss on it.
         lesson: The teacher's results; None if the recipe has no teacher.
     """
 

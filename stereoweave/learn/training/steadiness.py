@@ -18,8 +18,8 @@ from stereoweave.learn.models.weave import Refinement, WeaveNet, WeaveStages
 # Disturbance of the disparity before a refinement, in pixels of its maps, and of the disparity (in
 # levels) and the features after the aggregation: far above float32's rounding, and too small to move a match.
 _COARSE_DISTURBANCE_PX, _QUARTER_DISTURBANCE = 0.05, 0.01
-# An upsampled disparity may change by this much per unit of the disturbance. Each of a network's two or three
-# upsamplings amplifies what the one before it has amplified.
+# An upsampled disparity may change by this much per unit of the disturbance. Most pixels stay below it. The
+# slope is that of the mixture that training uses; `upsample_to_a_side` is up to twice as steep.
 _LARGEST_AMPLIFICATION = 2.0
 
 
@@ -76,18 +76,18 @@ def _keep_statistics(network: nn.Module) -> Iterator[None]:
 
 
 def _measure_fine(refinement: Refinement, disparity: Tensor, *others: Tensor) -> Tensor:
-    def upsample(disparity: Tensor) -> Tensor:
+    def enlarge(disparity: Tensor) -> Tensor:
         fine, logits, _ = refinement(disparity, *others)
         return upsample_convex(fine, logits)
 
     moved = disparity + _COARSE_DISTURBANCE_PX * torch.randn_like(disparity).sign()
-    return _mean_excess((upsample(moved) - upsample(disparity)) / _COARSE_DISTURBANCE_PX)
+    return _mean_excess((enlarge(moved) - enlarge(disparity)) / _COARSE_DISTURBANCE_PX)
 
 
 def _measure_coarse(
     network: WeaveNet, disparity: Tensor, other: Tensor, quarter: Tensor, decoded: Tensor
 ) -> Tensor:
-    def upsample(disparity: Tensor, other: Tensor, decoded: Tensor) -> Tensor:
+    def enlarge(disparity: Tensor, other: Tensor, decoded: Tensor) -> Tensor:
         assert network.completion is not None
         spread, features = network.completion(disparity, other, quarter, decoded)
         if network.propagation is not None:
@@ -96,7 +96,7 @@ def _measure_coarse(
 
     before = (disparity, other, decoded)
     after = (x + _QUARTER_DISTURBANCE * torch.randn_like(x) for x in before)
-    return _mean_excess((upsample(*after) - upsample(*before)) / _QUARTER_DISTURBANCE)
+    return _mean_excess((enlarge(*after) - enlarge(*before)) / _QUARTER_DISTURBANCE)
 
 
 def _mean_excess(slope: Tensor) -> Tensor:
