@@ -89,7 +89,8 @@ class Recipe:
         crop_size: Height and width of the crops that a step trains on.
         augment: Also scale, mirror and recolour crops.
         offset_share: Share of pairs whose right crop is shifted to the right, which increases disparity.
-        padded_share: Share of crops that end in padding, as pictures of other sizes do at inference.
+        padded_share: Share of augmented crops that end in padding. At inference, pictures whose sides are no
+            multiples of the network's are padded.
         validation_pairs: Number of pairs to validate on: collages with another seed, or held-out frames.
         held_out: Further validation sets, each with its name and its folder of rendered pairs.
         validate_every: Steps between validations; each validation is followed by a checkpoint.

@@ -63,10 +63,11 @@ _MOST_PADDING = 0.25
 
 
 def pad(sample: Sample, rng: np.random.Generator) -> Sample:
-    """Replace up to a quarter of the rows, at the bottom, and columns, on the right, by padding.
+    """Replace up to a quarter of the rows, at the bottom, and of the columns, on the right, by padding.
 
-    As in `Matcher`, padding repeats the last row and column that remain. Its disparity is unknown, and pixels
-    of the right view that show what is only in the replaced part of the left one are occluded.
+    Padding repeats the last row and column that remain; `Matcher` also pads above and on the left. The
+    disparity of padding is unknown. Pixels of the right view are occluded if they show what was only in the
+    replaced part of the left view.
     """
     rows, columns = sample.disparity_px.shape
     height, width = (side - int(rng.integers(int(side * _MOST_PADDING) + 1)) for side in (rows, columns))

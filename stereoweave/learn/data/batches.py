@@ -70,7 +70,7 @@ class Batches(Dataset[dict[str, torch.Tensor]]):
         if self.recipe.augment:
             crops = [augment(sample, *size, rng, self.recipe.offset_share) for sample in samples]
             share = self.recipe.padded_share
-            return [pad(x, rng) if share and rng.random() < share else x for x in crops]
+            return [pad(one, rng) if share and rng.random() < share else one for one in crops]
         return [crop(sample, *size, rng) for sample in samples]
 
     def _index(self, which: int, turn: int) -> int:

@@ -268,9 +268,18 @@ def test_padding_repeats_the_last_row_and_column_whose_disparity_is_known(sample
         assert (view[height:] == view[height - 1]).all()
     for values in (padded.disparity_px, padded.right_disparity_px):
         assert known.sum() == np.isfinite(values).sum() == np.isfinite(values[here]).sum() == height * width
-    # The right view's last columns show what the left one had in its replaced columns.
-    seen = np.arange(width) + sample.right_disparity_px[0, :width]
-    assert np.array_equal(padded.right_occluded[0, :width], seen > width - 1)
+
+
+def test_the_right_view_s_last_columns_are_occluded_once_the_left_view_lacks_what_they_show(sample):
+    # All of the wall is 5 px away: the last 5 of the columns that remain show the first 5 replaced ones.
+    far = np.full((HEIGHT, WIDTH), 5, np.float32)
+    wall = replace(sample, disparity_px=far, right_disparity_px=far, right_occluded=np.zeros(far.shape, bool))
+    padded = pad(wall, np.random.default_rng(1))
+    height, width = (np.isfinite(padded.right_disparity_px).any(axis).sum() for axis in (1, 0))
+    assert width < WIDTH
+    expected = np.zeros(far.shape, bool)
+    expected[:height, width - 5 : width] = True
+    assert np.array_equal(padded.right_occluded, expected)
 
 
 def test_a_quarter_of_the_rows_and_columns_are_padding_at_most(sample):
