@@ -178,9 +178,9 @@ def test_a_measurement_is_formatted_with_its_significant_digits(distance_m, unce
 
 def test_the_command_measures_between_two_pixels(capfd):
     pictures, calib = [TEXTURED / "left.png", TEXTURED / "right.png"], TEXTURED / "calib.txt"
-    measure(pictures, "320,240", "420,300", calib=calib, model="small")
+    measure(pictures, "300,320", "420,300", calib=calib, model="small")
     line, *_ = capfd.readouterr().out.splitlines()
-    measure(pictures, "320,240", "420,300", calib=calib, model="small", as_json=True)
+    measure(pictures, "300,320", "420,300", calib=calib, model="small", as_json=True)
     found = json.loads(capfd.readouterr().out)
     told_m, uncertainty_m = (float(words.split(" m")[0]) for words in line.split("±"))
     assert told_m == pytest.approx(found["distance_m"], abs=uncertainty_m)
