@@ -1,9 +1,11 @@
 """The number of threads to use, and parallel work on bands of image rows."""
 
 import os
+from collections import deque
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextvars import copy_context
+from itertools import pairwise
 from typing import TypeVar
 
 from stereoweave.arguments import check_whole_number
@@ -12,6 +14,7 @@ from stereoweave.errors import StereoweaveError
 Result = TypeVar("Result")
 
 _MOST_THREADS = 1024
+_pool = ThreadPoolExecutor(_MOST_THREADS)
 
 
 def thread_count(threads: int | None) -> int:
@@ -37,12 +40,31 @@ def usable_cores() -> int:
 
 
 def in_bands(work: Callable[[int, int], None], height: int, count: int, threads: int) -> None:
-    """Call `work(first_row, end_row)` for each of `count` bands of rows, in several threads."""
-    ends = [height * band // count for band in range(count + 1)]
+    """Call `work(first_row, end_row)` for each of `count` bands of rows, in this and other threads.
+
+    The other threads are kept for the next call, because to start one may take longer than a band. They may
+    be at work for other callers; this thread then works through the bands alone.
+    """
+    bands = deque(pairwise(height * band // count for band in range(count + 1)))
+
+    def work_off() -> None:
+        while True:
+            try:
+                band = bands.popleft()
+            except IndexError:
+                return
+            work(*band)
+
     # With the caller's context variables, such as the listener to its steps.
-    contexts = [copy_context() for _ in range(count)]
-    with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(lambda context, *rows: context.run(work, *rows), contexts, ends[:-1], ends[1:]))
+    others = [_pool.submit(copy_context().run, work_off) for _ in range(min(threads, count) - 1)]
+    try:
+        work_off()
+    finally:
+        bands.clear()  # after an error
+        started = [other for other in others if not other.cancel()]
+        wait(started)
+    for other in started:
+        other.result()
 
 
 def beyond_ctrl_c(work: Callable[[], Result]) -> Result:

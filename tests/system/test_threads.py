@@ -5,7 +5,7 @@ from contextvars import ContextVar
 import pytest
 
 from stereoweave.errors import StereoweaveError
-from stereoweave.system.threads import beyond_ctrl_c, thread_count, usable_cores
+from stereoweave.system.threads import beyond_ctrl_c, in_bands, thread_count, usable_cores
 
 
 def test_the_default_number_of_threads_is_the_number_of_usable_cores():
@@ -29,3 +29,46 @@ def test_work_beyond_ctrl_c_has_a_thread_and_the_caller_s_context():
     )
     with pytest.raises(ZeroDivisionError):
         beyond_ctrl_c(lambda: 1 / 0)
+
+
+def test_bands_cover_all_rows_once_in_the_caller_s_context():
+    chosen, seen = ContextVar("chosen"), []
+    chosen.set(7)
+    in_bands(lambda first, end: seen.append((first, end, chosen.get())), 10, 4, 3)
+    assert sorted(seen) == [(0, 2, 7), (2, 5, 7), (5, 7, 7), (7, 10, 7)]
+
+
+def test_as_many_threads_as_asked_work_on_bands_at_once():
+    together = threading.Barrier(3)
+    in_bands(lambda *_: together.wait(timeout=20), 3, 3, 3)
+
+
+def test_one_thread_works_on_bands_in_turn():
+    workers = set()
+    in_bands(lambda *_: workers.add(threading.get_ident()), 8, 8, 1)
+    assert workers == {threading.get_ident()}
+
+
+def test_bands_within_bands_do_not_wait_for_each_other():
+    rows = []
+
+    def work(first, end):
+        in_bands(lambda *inner: rows.append((first, *inner)), end - first, 3, 3)
+
+    in_bands(work, 9, 3, 3)
+    assert len(rows) == len(set(rows)) == 9
+
+
+@pytest.mark.parametrize("failing", [0, 1])
+def test_the_error_of_any_band_reaches_the_caller_after_all_have_ended(failing):
+    together, ended = threading.Barrier(2), []
+
+    def work(first, _):
+        together.wait(timeout=20)
+        if first == failing:
+            raise IndexError(f"row {first}")
+        ended.append(first)
+
+    with pytest.raises(IndexError, match=f"row {failing}"):
+        in_bands(work, 2, 2, 2)
+    assert ended == [1 - failing]
