@@ -104,8 +104,9 @@ def match_many(
 
 def _compile_ahead(matcher: Matcher, pairs: Sequence[StereoPair], options: MatchOptions) -> None:
     """Start to compile what follows the network."""
-    if not options.raw and (options.refined or matcher.refines):
+    if not options.raw:
         compile_ahead(rehearse_refining)
+    if not options.raw and (options.refined or matcher.refines):
         compile_ahead(rehearse_voting)
     if not all(matcher.sees_whole(*pair.left.shape[1::-1]) for pair in pairs):
         compile_ahead(rehearse_upsampling)

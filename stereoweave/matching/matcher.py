@@ -25,7 +25,7 @@ from stereoweave.matching.network import Network
 from stereoweave.matching.occlusion_fill import fill_occluded
 from stereoweave.matching.options import MatchOptions
 from stereoweave.matching.providers import CPU, PROVIDERS
-from stereoweave.matching.refine import refine
+from stereoweave.matching.refine import refine, refine_doubtful
 from stereoweave.matching.streaks import smooth_streaks
 from stereoweave.matching.subpixel import to_subpixel
 from stereoweave.stereo import LONGEST_SIDE_PX, Estimate, StereoPair
@@ -63,7 +63,7 @@ class Mode(NamedTuple):
 
 
 MODES = {"base": Mode(network="base"), "best": Mode(network="base", magnification=1.5, voted=True)}
-"""Modes by name; both refine every estimate. `best` is for stills: it improves edges but is much slower."""
+"""Modes by name; both refine widely. `best` is for stills: it improves edges but is much slower."""
 
 
 class Maps(NamedTuple):
@@ -79,7 +79,7 @@ class Matcher:
 
     Args:
         model: Name of a shipped network (`shipped_models`) or of a mode in `MODES`, or the path of an .onnx
-            file, whose estimates are refined on request only.
+            file, whose estimates are refined widely on request only.
         threads: Maximum number of threads per call; default: all cores available to the process.
         provider: Execution provider, a name in `providers.PROVIDERS`.
 
@@ -88,7 +88,7 @@ class Matcher:
         fixed_size: Height and width of a network with a fixed input size; None if it accepts any size.
         magnification: Greatest factor by which `match` magnifies pairs for the network; `estimate` ignores
             it.
-        refines: Whether every estimate is refined.
+        refines: Whether every estimate is refined widely.
         votes: Whether edges, speckles and unsure disparities are corrected by vote.
 
     Raises:
@@ -132,14 +132,15 @@ class Matcher:
     ) -> Estimate:
         """Estimate both views' disparities, the confidence and the occlusion mask of a rectified pair.
 
-        The left view's disparity is refined to a fraction of a pixel (`subpixel.to_subpixel`). Occluded
-        pixels are filled with the disparity of the background (`occlusion_fill.fill_occluded`).
+        Where the network is unsure, the pair is matched once more (`refine.refine_doubtful`). The left view's
+        disparity is refined to a fraction of a pixel (`subpixel.to_subpixel`). Occluded pixels are filled
+        with the disparity of the background (`occlusion_fill.fill_occluded`).
 
         Args:
             left: Left image, uint8 RGB [H, W, 3].
             right: Right image of the same size.
-            refined: Match once more at full resolution (`refine.refine`), which is slower but recovers thin
-                structures and sharper edges. The modes always do.
+            refined: Match once more wherever the network is not certain (`refine.refine`), which is slower
+                but recovers more thin structures and sharper edges. The modes always do.
             raw: Return the network's own disparities without any post-processing.
 
         Raises:
@@ -177,13 +178,14 @@ class Matcher:
     def finish(self, pair: StereoPair, found: Estimate, *, refined: bool = False) -> Estimate:
         """Post-process the network's estimate.
 
-        If `refined` or the matcher's mode requests it, `refine.refine` matches the pair once more. Visible
-        disparities are then refined to a fraction of a pixel, occluded pixels filled and streaks beyond the
-        other picture smoothed. Refined estimates finally get edges that follow the image.
+        The pair is matched once more where the network is unsure; if `refined` or the matcher's mode requests
+        it, wherever the network is not certain. Visible disparities are then refined to a fraction of a
+        pixel, occluded pixels filled and streaks beyond the other picture smoothed. Estimates that are
+        refined on request finally get edges that follow the image.
         """
         refined = refined or self.refines
-        if refined:
-            found = refine(pair.left, pair.right, found, self.threads)
+        search = refine if refined else refine_doubtful
+        found = search(pair.left, pair.right, found, self.threads)
         found = to_subpixel(pair.left, pair.right, found, self.threads)
         found = smooth_streaks(fill_occluded(found, pair.left_seen))
         if self.votes:

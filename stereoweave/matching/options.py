@@ -17,8 +17,9 @@ class MatchOptions:
         range_px: Least and greatest disparity of the left view in px; disparities outside the range are
             clipped, and get confidence 0 if they are outside by more than 1 px. Default: the network's range,
             extended if the pair exceeds it.
-        refined: Match once more at full resolution with the network's disparity as prior, which is slower but
-            recovers thin structures and sharper edges. `base` and `best` always do.
+        refined: Match once more at full resolution wherever the network is not certain, not only where it is
+            unsure. This is slower, but recovers more thin structures and sharper edges. `base` and `best`
+            always do.
         raw: Return the network's disparity without any refinement and occlusion filling.
 
     Raises:

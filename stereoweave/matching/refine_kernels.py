@@ -394,6 +394,20 @@ def along_columns(costs, own, search, large_step, levels, first_px, first, last,
 
 @kernel
 @typing.no_type_check
+def mark_matches(disparity_px, found_px, matched):
+    """Mark the right pixels that match left ones whose found disparity differs by more than PRECISE_PX."""
+    height, width = found_px.shape
+    for y in range(height):
+        for x in range(width):
+            found = found_px[y, x]
+            if abs(found - disparity_px[y, x]) > PRECISE_PX:
+                column = np.int64(np.rint(x - found))
+                if 0 <= column < width:
+                    matched[y, column] = True
+
+
+@kernel
+@typing.no_type_check
 def settle(found_px, other_px, trust, towards, disparity_px, agreed):
     """Write to agreed the mask of pixels at which both views agree, and replace their disparities.
 

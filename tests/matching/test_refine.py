@@ -6,7 +6,7 @@ from plain_refining import plain_census, plain_costs, plain_pick, plain_settled,
 from stereoweave.errors import StereoweaveError
 from stereoweave.matching import refine as refining
 from stereoweave.matching import refine_kernels as kernels
-from stereoweave.matching.refine import refine
+from stereoweave.matching.refine import refine, refine_doubtful
 from stereoweave.stereo import Estimate, StereoPair
 
 FAR_PX, NEAR_PX, STICK_PX = 6, 16, 12
@@ -92,7 +92,7 @@ def test_a_stick_is_found_in_the_right_view_where_its_network_is_certain_of_the_
     assert (abs(refined.disparity_px[:, in_left] - stick_px) < 1).mean() > 0.95
 
 
-def test_the_right_view_is_searched_up_to_4_px_from_the_matches_of_newly_found_left_disparities():
+def test_the_right_view_is_searched_around_the_matches_of_newly_found_left_disparities():
     disparity_px = np.zeros((11, 20), np.float32)
     found_px = disparity_px.copy()
     found_px[5, 14] = 6  # it matches column 8
@@ -100,7 +100,26 @@ def test_the_right_view_is_searched_up_to_4_px_from_the_matches_of_newly_found_l
     found_px[2, 18] = 1  # too little
     expected = np.zeros((11, 20), bool)
     expected[1:10, 4:13] = True
-    np.testing.assert_array_equal(refining.find_matches_of_found(disparity_px, found_px), expected)
+    np.testing.assert_array_equal(refining.find_matches_of_found(disparity_px, found_px, 4), expected)
+
+
+@pytest.mark.parametrize(("confidence", "share_found"), [(0.4, 0), (0.39, 0.95)])
+def test_only_doubtful_disparities_are_replaced_without_a_wide_search(scene, confidence, share_found):
+    left, right, left_px, right_px = scene
+    given = estimate_of(*without_stick(left_px, right_px), confidence=confidence)
+    found_px = refine_doubtful(left, right, given).disparity_px
+    in_left = slice(STICK.start + STICK_PX, STICK.stop + STICK_PX)
+    assert (abs(found_px[:, in_left] - STICK_PX) < 1).mean() >= share_found
+    if not share_found:
+        np.testing.assert_array_equal(found_px, given.disparity_px)
+
+
+def test_pixels_up_to_2_px_from_doubtful_ones_are_searched():
+    confidence = np.full((9, 12), 0.5, np.float32)
+    confidence[4, 6] = 0.39
+    expected = np.zeros((9, 12), bool)
+    expected[2:7, 4:9] = True
+    np.testing.assert_array_equal(refining.find_searched(confidence, refining.NARROW), expected)
 
 
 def test_correct_disparities_do_not_change_by_a_bit(scene):
@@ -193,13 +212,15 @@ def test_the_kernels_equal_the_plain_ones(rng):
         np.testing.assert_array_equal(view.census, plain_census(view.grey))
     searched = np.ones((24, 50), bool)
     searched[8:16, 14:36] = False  # 4 px and more inside the block
-    np.testing.assert_array_equal(refining.find_searched(given.confidence), searched)
+    np.testing.assert_array_equal(refining.find_searched(given.confidence, refining.WIDE), searched)
     search, size = refining._lay_out(np.zeros((1, 2), np.int32), searched, count)
     costs = np.empty(size, np.uint8)
     kernels.match(own, refining._align(other, first_px, count, -1), search, -1, count, 0, 24, costs)
     expected = plain_costs(own, other, first_px, count)
     np.testing.assert_array_equal(costs, expected[searched].ravel())
-    found_px, _ = refining._match_views(StereoPair(left=left, right=right), given, right_trust, 1)
+    found_px, _ = refining._match_views(
+        StereoPair(left=left, right=right), given, refining.WIDE, right_trust, 1
+    )
     expected_px = plain_pick(plain_sums(expected, own, searched), first_px)
     np.testing.assert_allclose(found_px[searched], expected_px[searched], atol=1e-5)
     np.testing.assert_allclose(found_px[~searched], given.disparity_px[~searched], atol=1 / 16)
@@ -217,10 +238,10 @@ def test_each_tile_searches_from_the_least_disparity_of_the_tiles_around(rng, mo
     right_trust = refining.right_confidence(given)
     own = refining._cues(left, given.disparity_px - first_px, given.confidence)
     other = refining._cues(right, given.right_disparity_px - first_px, np.float32(0.7) * right_trust)
-    searched = refining.find_searched(given.confidence)
+    searched = refining.find_searched(given.confidence, refining.WIDE)
     costs = plain_costs(own, other, first_px, count)
     expected_px = plain_pick(plain_sums(costs, own, searched), first_px)
-    found_px, _ = refining._match_views(pair, given, right_trust, 2)
+    found_px, _ = refining._match_views(pair, given, refining.WIDE, right_trust, 2)
     np.testing.assert_allclose(found_px[searched], expected_px[searched], atol=1e-5)
     # The last tile row sees no disparity below 50 px, neither in its own tiles nor in those around.
     assert found_px[128:, 256:].min() > 30 + moved_px
@@ -229,7 +250,7 @@ def test_each_tile_searches_from_the_least_disparity_of_the_tiles_around(rng, mo
 def test_both_views_settle_as_the_plain_ones(rng):
     left, right, given = random_pair(rng)
     right_trust = refining.right_confidence(given)
-    found_px = refining._match_views(StereoPair(left=left, right=right), given, right_trust, 1)
+    found_px = refining._match_views(StereoPair(left=left, right=right), given, refining.WIDE, right_trust, 1)
     refined = refine(left, right, given)
     expected = plain_settled(given.disparity_px, *found_px, given.confidence, -1)
     np.testing.assert_array_equal(refined.disparity_px, expected)
@@ -241,16 +262,16 @@ def test_both_views_settle_as_the_plain_ones(rng):
 def test_a_right_view_is_matched_as_the_left_one_of_the_mirrored_pair(scene, monkeypatch):
     # What makes the two views differ: the right one is coarser, and is searched after the left one.
     monkeypatch.setattr(refining, "_COARSE", np.float32(1))
-    monkeypatch.setattr(refining, "find_matches_of_found", lambda _, found_px: np.zeros(found_px.shape, bool))
+    monkeypatch.setattr(refining, "find_matches_of_found", lambda _, found_px, __: found_px < -1e9)
     left, right, _, right_px = scene
     pair, given = StereoPair(left=left, right=right), estimate_of(right_px, right_px, confidence=0)
     trust = np.zeros(right_px.shape, np.float32)
     trust[10:30, 30:100] = 0.9
     given = Estimate(**vars(given) | {"confidence": trust})
-    found_px, right_found_px = refining._match_views(pair, given, trust, 1)
+    found_px, right_found_px = refining._match_views(pair, given, refining.WIDE, trust, 1)
     turned = {name: values[:, ::-1].copy() for name, values in vars(given).items() if name in MAPS}
     mirrored_px, right_mirrored_px = refining._match_views(
-        pair.mirror(), Estimate(**vars(given) | turned), trust[:, ::-1].copy(), 1
+        pair.mirror(), Estimate(**vars(given) | turned), refining.WIDE, trust[:, ::-1].copy(), 1
     )
     np.testing.assert_array_equal(mirrored_px[:, ::-1], right_found_px)
     np.testing.assert_array_equal(right_mirrored_px[:, ::-1], found_px)
