@@ -38,16 +38,15 @@ _SLACK_PX = 0.6
 
 
 class _Texture(NamedTuple):
-    """Windows of a small grey image, with the local mean removed.
+    """Windows around the pixels of some rows of a small grey image, with the local mean removed.
 
     Attributes:
-        windows: Grey levels minus their local mean, in windows [first row, centre column, rows, columns].
-        scale: Factor that normalises the window around each pixel to length 1; 0 for plain windows, and in
-            rows that are not matched.
+        windows: Grey levels minus their local mean, in windows [row, centre column, rows, columns].
+        scale: Factor that normalises the window around each pixel to length 1; 0 for plain windows.
     """
 
-    windows: Float32[np.ndarray, "h2 w r c"]
-    scale: Float32[np.ndarray, "h w"]
+    windows: Float32[np.ndarray, "n w r c"]
+    scale: Float32[np.ndarray, "n w"]
 
 
 def find_range(pair: StereoPair) -> tuple[float, float] | None:
@@ -60,7 +59,7 @@ def find_range(pair: StereoPair) -> tuple[float, float] | None:
     Pixels without content are ignored. Returns None if there are too few matches, as in plain images or
     images of different scenes.
     """
-    disparity_px = _find_disparities(pair, None)
+    disparity_px = _find_disparities(pair, None, _LEAST_MATCHES)
     if len(disparity_px) < _LEAST_MATCHES:
         return None
     low_px, high_px = np.percentile(disparity_px, [_ENDS_PERCENT, 100 - _ENDS_PERCENT])
@@ -71,7 +70,7 @@ def find_range(pair: StereoPair) -> tuple[float, float] | None:
 def goes_beyond(pair: StereoPair, where: Bool[np.ndarray, "h w"], range_px: tuple[float, float]) -> bool:
     """Return whether the region `where` of the left image contains disparities outside `range_px`."""
     slack_px = _SLACK_PX * _scale(pair.left)
-    disparity_px = _find_disparities(pair, where)
+    disparity_px = _find_disparities(pair, where, _LEAST_BEYOND)
     beyond = (disparity_px < range_px[0] - slack_px) | (disparity_px > range_px[1] + slack_px)
     return bool(beyond.sum() >= max(_LEAST_BEYOND, _LEAST_SHARE_BEYOND * len(beyond)))
 
@@ -82,14 +81,38 @@ def _scale(image: UInt8[np.ndarray, "h w 3"]) -> float:
     return width / min(width, _WIDTH_PX)
 
 
-def _find_disparities(pair: StereoPair, where: Bool[np.ndarray, "h w"] | None) -> Float[np.ndarray, " n"]:
-    """Return the disparities in px of the matched left pixels, restricted to the mask `where` if given."""
-    left, right = _small_grey(pair.left), _small_grey(pair.right)
+def _find_disparities(
+    pair: StereoPair, where: Bool[np.ndarray, "h w"] | None, least_matches: int
+) -> Float[np.ndarray, " n"]:
+    """Return the disparities in px of the matched left pixels, restricted to the mask `where` if given.
+
+    May return none if there are fewer than `least_matches`.
+    """
+    left = _small_grey(pair.left)
     wanted = _find_inner(pair.left_seen, left)
     if where is not None:
         wanted &= _small_mask(where, left)
-    matches = _keep_supported(_match_rows(left, right, wanted, _find_inner(pair.right_seen, right)))
-    return matches[:, 2] * _scale(pair.left)
+    rows = _sample_rows(wanted)
+    if not len(rows):
+        return np.empty(0)
+    own = _texture(left, rows)
+    places, columns = _find_salient(left, rows, wanted[rows] & (own.scale > 0))
+    if len(places) < least_matches:
+        return np.empty(0)
+    right = _small_grey(pair.right)
+    other = _texture(right, rows)
+    other.scale[~_find_inner(pair.right_seen, right)[rows]] = 0
+    found, disparity_px = _match_rows(own, places, columns, other)
+    matches = np.stack([columns[found], rows[places[found]], disparity_px], axis=1)
+    return _keep_supported(matches)[:, 2] * _scale(pair.left)
+
+
+def _sample_rows(wanted: Bool[np.ndarray, "h w"]) -> Int[np.ndarray, " n"]:
+    """Return the rows in which to match pixels: those of an even sample that have a wanted pixel."""
+    height = len(wanted)
+    rows = np.linspace(_WINDOW_ROWS // 2, height - 1 - _WINDOW_ROWS // 2, min(_ROWS, height // 4))
+    rows = rows.round().astype(int)
+    return rows[wanted[rows].any(1)]
 
 
 def _small_grey(image: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h2 w2"]:
@@ -122,30 +145,21 @@ def _find_inner(
 
 
 def _match_rows(
-    left: Float32[np.ndarray, "h w"],
-    right: Float32[np.ndarray, "h w"],
-    wanted: Bool[np.ndarray, "h w"],
-    seen: Bool[np.ndarray, "h w"],
-) -> Float[np.ndarray, "n 3"]:
-    """Return the column, row and disparity in px of each match that is unambiguous in both directions.
+    own: _Texture, places: Int[np.ndarray, " n"], columns: Int[np.ndarray, " n"], other: _Texture
+) -> tuple[Bool[np.ndarray, " n"], Float[np.ndarray, " m"]]:
+    """Return the mask of pixels with a match that is unambiguous in both directions, and its disparity in px.
 
     Args:
-        left: Left image, grey levels.
-        right: Right image, grey levels.
-        wanted: Mask of left pixels to match.
-        seen: Mask of right pixels that may match.
+        own: Rows of the left image.
+        places: Which of these rows each pixel to match is in.
+        columns: Columns of the pixels.
+        other: The same rows of the right image.
     """
-    height = left.shape[0]
-    rows = np.linspace(_WINDOW_ROWS // 2, height - 1 - _WINDOW_ROWS // 2, min(_ROWS, height // 4))
-    rows = rows.round().astype(int)
-    own, other = _texture(left, rows), _texture(right, rows)
-    other.scale[~seen] = 0
-    rows, columns = _find_salient(left, rows, wanted & (own.scale > 0))
-    likeness = _likeness(own, rows, columns, other)
+    likeness = _likeness(own, places, columns, other)
     best, offsets_px, sure = _peaks(likeness)
-    back = _likeness(other, rows[sure], best[sure], own).argmax(1)
+    back = _likeness(other, places[sure], best[sure], own).argmax(1)
     sure[sure] = np.abs(back - columns[sure]) <= 1
-    return np.stack([columns, rows, columns - best - offsets_px], axis=1)[sure]
+    return sure, (columns - best - offsets_px)[sure]
 
 
 def _peaks(
@@ -167,30 +181,40 @@ def _peaks(
 
 
 def _find_salient(
-    grey: Float32[np.ndarray, "h w"], rows: Int[np.ndarray, " r"], wanted: Bool[np.ndarray, "h w"]
+    grey: Float32[np.ndarray, "h w"], rows: Int[np.ndarray, " r"], wanted: Bool[np.ndarray, "r w"]
 ) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
-    """Return the rows and columns of the highest gradient in every _SPACING_PX columns, within `wanted`."""
-    steps = np.abs(cv2.Sobel(grey, cv2.CV_32F, 1, 0))[rows]
+    """Return the pixels of the highest gradient in every _SPACING_PX columns of some rows, within `wanted`.
+
+    Returns:
+        Which of the rows each pixel is in, and its column.
+    """
     count = grey.shape[1] // _SPACING_PX
+    smooth = grey[rows - 1] + 2 * grey[rows] + grey[rows + 1]
+    steps = np.zeros_like(smooth)
+    steps[:, 1:-1] = np.abs(smooth[:, 2:] - smooth[:, :-2])
     cells = steps[:, : count * _SPACING_PX].reshape(len(rows), count, _SPACING_PX)
     columns = cells.argmax(2) + _SPACING_PX * np.arange(count)
-    places = np.repeat(rows, count), columns.ravel()
-    ok = wanted[places]
-    return places[0][ok], places[1][ok]
+    ok = np.take_along_axis(wanted, columns, 1)
+    return ok.nonzero()[0], columns[ok]
 
 
 def _texture(grey: Float32[np.ndarray, "h w"], rows: Int[np.ndarray, " r"]) -> _Texture:
-    """Return the windows of an image, and their scale in the given rows."""
-    size = (_WINDOW_COLUMNS, _WINDOW_ROWS)
-    uneven = grey - cv2.blur(grey, size)
+    """Return the windows around the pixels of the given rows, and their scale."""
+    size, width = (_WINDOW_COLUMNS, _WINDOW_ROWS), grey.shape[1]
+    above, beside = _WINDOW_ROWS // 2, _WINDOW_COLUMNS // 2
+    # Of each row, the rows of its windows and of the windows whose means these need.
+    padded = cv2.copyMakeBorder(grey, above, above, 0, 0, cv2.BORDER_REFLECT_101)
+    strips = padded[rows[:, None] + np.arange(-above, _WINDOW_ROWS + above)].reshape(-1, width)
+    uneven = (
+        (strips - cv2.blur(strips, size)).reshape(len(rows), -1, width)[:, above:-above].reshape(-1, width)
+    )
     # Rounding in cv2.blur may produce values slightly below 0.
-    contrast = np.sqrt(np.maximum(cv2.blur(uneven * uneven, size)[rows], 0))
+    contrast = np.sqrt(np.maximum(cv2.blur(uneven * uneven, size)[above::_WINDOW_ROWS], 0))
     length = np.sqrt(np.float32(_WINDOW_ROWS * _WINDOW_COLUMNS)) * contrast
-    scale = np.zeros_like(grey)
-    scale[rows] = np.divide(1, length, out=np.zeros_like(length), where=contrast >= _LEAST_CONTRAST_LEVELS)
-    beside = _WINDOW_COLUMNS // 2
+    scale = np.divide(1, length, out=np.zeros_like(length), where=contrast >= _LEAST_CONTRAST_LEVELS)
     around = cv2.copyMakeBorder(uneven, 0, 0, beside, beside, cv2.BORDER_REPLICATE)
-    return _Texture(np.lib.stride_tricks.sliding_window_view(around, size[::-1]), scale)
+    around = around.reshape(len(rows), _WINDOW_ROWS, -1)
+    return _Texture(np.lib.stride_tricks.sliding_window_view(around, size[::-1], (1, 2))[:, 0], scale)
 
 
 def _likeness(
@@ -201,9 +225,9 @@ def _likeness(
     likeness = np.empty((len(rows), width), np.float32)
     # Works row by row, because the windows of one row, a matrix [77, W], fit in the CPU cache.
     for row in np.unique(rows):
-        here, first = rows == row, row - _WINDOW_ROWS // 2
-        within = own.windows[first, columns[here]].reshape(-1, pixels)
-        along = other.windows[first].transpose(1, 2, 0).reshape(pixels, width)
+        here = rows == row
+        within = own.windows[row, columns[here]].reshape(-1, pixels)
+        along = other.windows[row].transpose(1, 2, 0).reshape(pixels, width)
         # Uses einsum, because NumPy's matrix product would use all cores regardless of the caller's limit.
         likeness[here] = np.einsum("nk,kw->nw", within, along)
     return likeness * own.scale[rows, columns, None] * other.scale[rows]
