@@ -294,22 +294,27 @@ def _find_wider_range(
     `found` is the estimate within the network's range.
     """
     doubtful = _find_doubtful(found, max_disparity_px)
-    if 100 * doubtful.mean() < _DOUBTFUL_PERCENT or not goes_beyond(pair, doubtful, (0, max_disparity_px)):
+    if 100 * _share(doubtful) < _DOUBTFUL_PERCENT or not goes_beyond(pair, doubtful, (0, max_disparity_px)):
         return None
     return find_range(pair)
 
 
 def _find_doubtful(found: Estimate, max_disparity_px: float) -> Bool[np.ndarray, "h w"]:
     """Return the mask of uncertain pixels, whose true disparity may be outside the network's range."""
-    near_end = np.abs(found.disparity_px - max_disparity_px / 2) > max_disparity_px / 2 - _MARGIN_PX
+    inside = cv2.inRange(found.disparity_px, _MARGIN_PX, max_disparity_px - _MARGIN_PX) > 0
     doubtful = found.confidence < _CONFIDENT
     # Where the matches of most pixels lie outside the right picture, the range is wrong.
-    if found.occluded.mean() < _MOSTLY_OCCLUDED:
+    if _share(found.occluded) < _MOSTLY_OCCLUDED:
         doubtful &= ~found.occluded
-    doubtful |= (near_end & (found.confidence < _CONFIDENT_AT_END)) | (found.disparity_px <= 0)
+    doubtful |= (~inside & (found.confidence < _CONFIDENT_AT_END)) | (found.disparity_px <= 0)
     # Keep larger areas only: a network is uncertain at every edge.
     small = cv2.resize(doubtful.astype(np.float32), None, fx=1 / 8, fy=1 / 8, interpolation=cv2.INTER_AREA)
     return cv2.resize(small, doubtful.shape[::-1], interpolation=cv2.INTER_LINEAR) > 0.5
+
+
+def _share(mask: Bool[np.ndarray, "h w"]) -> float:
+    # Several times as fast as the mean of a mask.
+    return np.count_nonzero(mask) / mask.size
 
 
 def _prepare_for_range(
