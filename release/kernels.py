@@ -123,13 +123,14 @@ def _compile() -> Iterator[Any]:
     from stereoweave.bench.classical.matchers import rehearse_classical_matchers
     from stereoweave.bench.mc_cnn.steps import rehearse_mc_cnn
     from stereoweave.matching.edge_vote.vote import rehearse_voting
+    from stereoweave.matching.matcher import rehearse_finishing
     from stereoweave.matching.refine import rehearse_refining
     from stereoweave.matching.upsample import rehearse_upsampling
     from stereoweave.rendering.rehearsals import rehearse_drawing, rehearse_filling, rehearse_moving
     from stereoweave.system.jit import Kernel
     from stereoweave.video.carried_frames import rehearse_carrying
 
-    matching = rehearse_refining, rehearse_voting, rehearse_upsampling, rehearse_carrying
+    matching = rehearse_refining, rehearse_finishing, rehearse_voting, rehearse_upsampling, rehearse_carrying
     rendering = rehearse_drawing, rehearse_filling, rehearse_moving
     for rehearse in (*matching, *rendering, rehearse_classical_matchers, rehearse_mc_cnn):
         rehearse()

@@ -22,6 +22,7 @@ from stereoweave.matching.left_right_check import at_match, find_occluded
 from stereoweave.matching.matcher import (
     PIXEL_PAIRS_AT_ONCE,
     Matcher,
+    rehearse_finishing,
 )
 from stereoweave.matching.options import DEFAULT_OPTIONS, OMIT_RANGE, MatchOptions
 from stereoweave.matching.refine import rehearse_refining, right_confidence
@@ -105,6 +106,7 @@ def match_many(
 def _compile_ahead(matcher: Matcher, pairs: Sequence[StereoPair], options: MatchOptions) -> None:
     """Start to compile what follows the network."""
     if not options.raw:
+        compile_ahead(rehearse_finishing)
         compile_ahead(rehearse_refining)
     if not options.raw and (options.refined or matcher.refines):
         compile_ahead(rehearse_voting)

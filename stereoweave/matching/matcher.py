@@ -340,6 +340,13 @@ class Matcher:
         )
 
 
+def rehearse_finishing() -> None:
+    """Fill and smooth a small estimate, to compile the kernels (`compiling_ahead.compile_ahead`)."""
+    px = np.zeros((32, 32), np.float32)
+    found = Estimate(disparity_px=px, right_disparity_px=px, confidence=px, occluded=px > 0)
+    smooth_streaks(fill_occluded(found))
+
+
 def shipped_models() -> list[str]:
     """Return the names of the shipped networks in alphabetical order."""
     return sorted(Path(file.name).stem for file in _weights_folder().iterdir() if file.name.endswith(".onnx"))
