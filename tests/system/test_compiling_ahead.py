@@ -86,6 +86,7 @@ def compiled_by(line):
     return {file.name.split(".")[-4] for file in kernels_folder().glob("*.o")}
 
 
+MATCHING = {"refine_kernels", "occlusion_fill_kernels", "streak_kernels", "vote_kernels"}
 RENDERING = {"background_kernels", "draw_kernels", "hole_filling_kernels"}
 
 
@@ -94,11 +95,11 @@ RENDERING = {"background_kernels", "draw_kernels", "hole_filling_kernels"}
     ("line", "modules"),
     [
         ("depth pairs --raw -o many", set()),
-        ("depth pairs -o many", {"refine_kernels", "vote_kernels"}),
+        ("depth pairs -o many", MATCHING),
         ("depth pairs/one/left.png pairs/one/right.png --raw -o out", RENDERING),
         (
             "view pairs/one/left.png pairs/one/right.png --layout rgbd -o view.png",
-            {"refine_kernels", "vote_kernels"},
+            MATCHING,
         ),
     ],
     ids=["no report, raw", "no report", "raw", "no view"],
