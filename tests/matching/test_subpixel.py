@@ -3,8 +3,10 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from plain_subpixel import plain_change, plain_compare, plain_smooth
 
 from stereoweave.matching.subpixel import to_subpixel
+from stereoweave.matching.subpixel_kernels import change, compare, smooth
 from stereoweave.stereo import Estimate
 
 HEIGHT, WIDTH = 120, 200
@@ -144,3 +146,37 @@ def test_disparity_becomes_negative_only_if_the_input_is(texture):
     given_px[0, 0] = -2
     converged = to_subpixel(left, right, estimate_of(given_px))
     assert np.median(errors_px(converged, -0.4)) < 0.05
+
+
+@pytest.mark.parametrize("shape", [(7, 1), (1, 9), (5, 3)], ids=["columns", "rows", "both"])
+def test_the_smoothing_kernel_agrees_with_its_plain_reference(rng, shape):
+    padded_px = np.cumsum(rng.normal(0, 0.4, (40, 50)), axis=1).astype(np.float32)
+    nearness = rng.uniform(0.1, 1, shape).astype(np.float32)
+    smooth_px = np.empty((40 - shape[0] + 1, 50 - shape[1] + 1), np.float32)
+    smooth(padded_px, nearness, 0.6, smooth_px)
+    expected_px = plain_smooth(padded_px.astype(float), nearness, 0.6)
+    np.testing.assert_allclose(smooth_px, expected_px, atol=1e-4)
+
+
+def test_the_comparing_kernel_agrees_with_its_plain_reference(rng):
+    here, there = rng.integers(0, 256, (2, 20, 60), dtype=np.uint8)
+    given_px = rng.uniform(-5, 70, (20, 60)).astype(np.float32)
+    smooth_px = cv2.resize(given_px, (30, 10), interpolation=cv2.INTER_AREA)
+    start_px, means = np.empty_like(given_px), np.empty((10, 4, 30), np.float32)
+    compare(here, there, given_px, smooth_px, 6.0, 1.2, start_px, means)
+    expected_px, expected = plain_compare(here, there, given_px, smooth_px, 6.0, 1.2)
+    assert 0.05 < (expected_px != given_px).mean() < 0.95
+    np.testing.assert_allclose(start_px, expected_px, atol=1e-4)
+    np.testing.assert_allclose(means, expected, rtol=1e-3, atol=0.5)
+
+
+def test_the_changing_kernel_agrees_with_its_plain_reference(rng):
+    given_px, start_px = rng.uniform(0, 3, (2, 20, 60)).astype(np.float32)
+    change_px = rng.uniform(-1, 1, (10, 30)).astype(np.float32)
+    occluded = rng.integers(0, 2, (20, 60), dtype=np.uint8)
+    found_px = np.full_like(given_px, -1)
+    change(given_px, start_px, change_px, occluded, 0.5, 0.25, 4, 15, found_px)
+    expected_px = plain_change(given_px, start_px, change_px, occluded, 0.5, 0.25)
+    np.testing.assert_allclose(found_px[4:15], expected_px[4:15], atol=1e-5)
+    assert (found_px[:4] == -1).all()
+    assert (found_px[15:] == -1).all()
