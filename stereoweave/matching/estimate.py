@@ -26,6 +26,7 @@ from stereoweave.matching.matcher import (
 )
 from stereoweave.matching.options import DEFAULT_OPTIONS, OMIT_RANGE, MatchOptions
 from stereoweave.matching.refine import rehearse_refining, right_confidence
+from stereoweave.matching.subpixel import rehearse_subpixel
 from stereoweave.matching.upsample import enlarge, rehearse_upsampling
 from stereoweave.stereo import LONGEST_SIDE_PX, Estimate, StereoPair
 from stereoweave.system.compiling_ahead import compile_ahead
@@ -106,10 +107,10 @@ def match_many(
 def _compile_ahead(matcher: Matcher, pairs: Sequence[StereoPair], options: MatchOptions) -> None:
     """Start to compile what follows the network."""
     if not options.raw:
-        compile_ahead(rehearse_finishing)
         compile_ahead(rehearse_refining)
-    if not options.raw and (options.refined or matcher.refines):
-        compile_ahead(rehearse_voting)
+        compile_ahead(rehearse_finishing)
+        if options.refined or matcher.refines:
+            compile_ahead(rehearse_voting)
     if not all(matcher.sees_whole(*pair.left.shape[1::-1]) for pair in pairs):
         compile_ahead(rehearse_upsampling)
 

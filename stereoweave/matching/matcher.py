@@ -341,10 +341,10 @@ class Matcher:
 
 
 def rehearse_finishing() -> None:
-    """Fill and smooth a small estimate, to compile the kernels (`compiling_ahead.compile_ahead`)."""
-    px = np.zeros((32, 32), np.float32)
+    """Finish a small estimate, to compile what follows `refine` (`compiling_ahead.compile_ahead`)."""
+    image, px = np.zeros((32, 32, 3), np.uint8), np.zeros((32, 32), np.float32)
     found = Estimate(disparity_px=px, right_disparity_px=px, confidence=px, occluded=px > 0)
-    smooth_streaks(fill_occluded(found))
+    smooth_streaks(fill_occluded(to_subpixel(image, image, found, 1)))
 
 
 def shipped_models() -> list[str]:

@@ -83,13 +83,6 @@ def to_subpixel(
     return replace(estimate, disparity_px=np.ascontiguousarray(found_px[:height, :width]))
 
 
-def rehearse_subpixel() -> None:
-    """Refine a small estimate, to compile all kernels (`compiling_ahead.compile_ahead`)."""
-    image, px = np.zeros((32, 32, 3), np.uint8), np.zeros((32, 32), np.float32)
-    estimate = Estimate(disparity_px=px, right_disparity_px=px, confidence=px, occluded=px > 0)
-    to_subpixel(image, image, estimate, 1)
-
-
 def _pad_to_even(values: np.ndarray) -> np.ndarray:
     """Repeat the last row and column if needed to make both sides even."""
     height, width = values.shape

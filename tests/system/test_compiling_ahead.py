@@ -86,7 +86,8 @@ def compiled_by(line):
     return {file.name.split(".")[-4] for file in kernels_folder().glob("*.o")}
 
 
-MATCHING = {"refine_kernels", "occlusion_fill_kernels", "streak_kernels", "vote_kernels"}
+FINISHING = {"subpixel_kernels", "occlusion_fill_kernels", "streak_kernels"}
+MATCHING = {"refine_kernels", "vote_kernels", *FINISHING}
 RENDERING = {"background_kernels", "draw_kernels", "hole_filling_kernels"}
 
 
