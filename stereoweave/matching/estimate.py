@@ -26,7 +26,6 @@ from stereoweave.matching.matcher import (
 )
 from stereoweave.matching.options import DEFAULT_OPTIONS, OMIT_RANGE, MatchOptions
 from stereoweave.matching.refine import rehearse_refining, right_confidence
-from stereoweave.matching.subpixel import rehearse_subpixel
 from stereoweave.matching.upsample import enlarge, rehearse_upsampling
 from stereoweave.stereo import LONGEST_SIDE_PX, Estimate, StereoPair
 from stereoweave.system.compiling_ahead import compile_ahead
