@@ -75,10 +75,7 @@ def to_subpixel(
     count = thread_count(threads)
     bands = max(1, min(max(count, here.size // _BAND_PIXELS), len(here) // _LEAST_BAND_PX))
     # Bands consist of row pairs, so no band splits a row of the coarse grid.
-    if bands == 1:
-        move(0, len(here) // 2)  # memory allocation would take a fifth longer in another thread
-    else:
-        in_bands(move, len(here) // 2, bands, count)
+    in_bands(move, len(here) // 2, bands, count)
     height, width = estimate.disparity_px.shape
     return replace(estimate, disparity_px=np.ascontiguousarray(found_px[:height, :width]))
 
