@@ -2,9 +2,10 @@
 
 The method is semi-global matching (Hirschmueller 2008) at and around pixels of low confidence, and right
 pixels that match newly found left disparities, over all disparities from the network's least one nearby to
-its greatest one. A candidate's cost is the colour and census difference, plus the confidence-weighted
-distance to the network's disparity. Where both views agree, the found disparities replace the network's. This
-recovers edges, as well as thin structures that are below the network's resolution.
+its greatest one. A candidate's cost is the difference in colour (in grey levels, if few pixels are searched)
+and census, plus the confidence-weighted distance to the network's disparity. Where both views agree, the
+found disparities replace the network's. This recovers edges, as well as thin structures that are below the
+network's resolution.
 """
 
 import math
@@ -15,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32, UInt8
 
 from stereoweave.matching.contrast import measure_contrast
-from stereoweave.matching.exposure import equalise_right
+from stereoweave.matching.exposure import equalise_grey, equalise_right
 from stereoweave.matching.left_right_check import at_match, is_occluded, measure_disagreement
 from stereoweave.matching.step_penalties import penalise_large_steps
 from stereoweave.stereo import Estimate, StereoPair, check_fits
@@ -59,18 +60,20 @@ class Extent(NamedTuple):
         reach_px: So are the pixels up to this far around them.
         both_views: Whether right pixels of low confidence are searched, too. The matches of newly found left
             disparities always are.
+        in_colour: Whether colours are compared instead of grey levels.
     """
 
     confidence: float
     reach_px: int
     both_views: bool
+    in_colour: bool
 
 
 # These are 36 % of the left pixels of real pairs. New views gain 0.1 dB from a search everywhere, and lose
 # 0.3 dB without the pixels around.
-WIDE = Extent(confidence=0.85, reach_px=4, both_views=True)
+WIDE = Extent(confidence=0.85, reach_px=4, both_views=True, in_colour=True)
 # These are 18 % of the left and 17 % of the right pixels, and bring two thirds of what a wide search does.
-NARROW = Extent(confidence=0.4, reach_px=2, both_views=False)
+NARROW = Extent(confidence=0.4, reach_px=2, both_views=False, in_colour=False)
 
 
 class _View(NamedTuple):
@@ -124,7 +127,10 @@ def refine_doubtful(
     estimate: Estimate,
     threads: int | None = None,
 ) -> Estimate:
-    """Refine as `refine` does, but only where the confidence is below 0.4; this takes a third of the time."""
+    """Refine as `refine` does, but only where the confidence is below 0.4, and by grey levels.
+
+    This takes less than half of the time.
+    """
     return _refine(left, right, estimate, NARROW, threads)
 
 
@@ -137,10 +143,10 @@ def _refine(
 ) -> Estimate:
     pair = StereoPair(left=left, right=right)
     check_fits(estimate, pair)
-    pair = StereoPair(left=left, right=equalise_right(pair, estimate))
+    images = (left, equalise_right(pair, estimate)) if extent.in_colour else equalise_grey(pair, estimate)
     trust, right_trust = np.asarray(estimate.confidence, np.float32, order="C"), right_confidence(estimate)
     count = min(_MOST_THREADS, thread_count(threads))
-    found_px, right_found_px = _match_views(pair, estimate, extent, right_trust, count)
+    found_px, right_found_px = _match_views(images, estimate, extent, right_trust, count)
     disparity_px = _settle(estimate.disparity_px, found_px, right_found_px, trust, -1)
     right_disparity_px = _settle(
         estimate.right_disparity_px, right_found_px, found_px, _COARSE * right_trust, 1
@@ -197,7 +203,7 @@ def _settle(
 
 
 def _match_views(
-    pair: StereoPair,
+    images: tuple[UInt8[np.ndarray, "h w *c"], UInt8[np.ndarray, "h w *c"]],
     estimate: Estimate,
     extent: Extent,
     right_trust: Float32[np.ndarray, "h w"],
@@ -205,8 +211,8 @@ def _match_views(
 ) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
     """Match both views, and return the disparities of least cost in each view."""
     first_px, count = _candidates(estimate)
-    left = _cues(pair.left, estimate.disparity_px - first_px, estimate.confidence)
-    right = _cues(pair.right, estimate.right_disparity_px - first_px, _COARSE * right_trust)
+    left = _cues(images[0], estimate.disparity_px - first_px, estimate.confidence)
+    right = _cues(images[1], estimate.right_disparity_px - first_px, _COARSE * right_trust)
     left_view = _View(
         left, _align(right, first_px, count, -1), find_searched(estimate.confidence, extent), -1
     )
@@ -326,20 +332,21 @@ def _lay_out(
     return search, int(total[0])
 
 
-def _cues(image: UInt8[np.ndarray, "h w 3"], above_first_px: np.ndarray, trust: np.ndarray) -> "Cues":
+def _cues(image: UInt8[np.ndarray, "h w *c"], above_first_px: np.ndarray, trust: np.ndarray) -> "Cues":
+    """Return what the kernels read of a colour or grey image."""
     from stereoweave.matching import refine_kernels as kernels
 
-    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     codes = np.empty(grey.shape, np.uint32)
     kernels.census(grey, codes)
-    colour = np.stack(cv2.split(image), 1)
-    rows = colour.reshape(-1, grey.shape[1])
+    levels = np.stack(cv2.split(image), 1)
+    rows = levels.reshape(-1, grey.shape[1])
     return kernels.Cues(
         grey=grey,
         census=codes,
-        colour=colour,
-        darkest=_halfway(colour, cv2.erode(rows, _BESIDE).reshape(colour.shape)),
-        brightest=_halfway(colour, cv2.dilate(rows, _BESIDE).reshape(colour.shape)),
+        levels=levels,
+        darkest=_halfway(levels, cv2.erode(rows, _BESIDE).reshape(levels.shape)),
+        brightest=_halfway(levels, cv2.dilate(rows, _BESIDE).reshape(levels.shape)),
         prior=np.rint(above_first_px * kernels.SUBSTEPS).astype(np.uint16),
         trust=np.rint(trust * kernels.MOST_TRUST).astype(np.uint16),
     )

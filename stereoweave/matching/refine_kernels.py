@@ -35,6 +35,7 @@ SLACK_PX = 2
 LARGEST_MOVE_PX = 24
 """Border disparities that differ from the surface's by more than this belong to another surface."""
 _CENSUS_RADIUS = 2
+_COLOURS = 3
 _NEVER, _HIGHEST = np.uint16(30000), np.uint16(65535)
 _SIX = np.uint16(6)
 # Numba widens sums to 64 bits unless both operands are narrow; wide sums would halve the vectors' length.
@@ -49,16 +50,16 @@ class Cues(typing.NamedTuple):
     Attributes:
         grey: uint8, grey levels, which determine the penalty for large disparity steps.
         census: uint32, one bit for each of the 24 surrounding pixels, set if that pixel is darker.
-        colour: uint8 [H, 3, W].
-        darkest: uint8 [H, 3, W], least level within half a pixel to either side.
-        brightest: uint8 [H, 3, W], greatest level within half a pixel to either side.
+        levels: uint8 [H, C, W], the three colours, or the grey levels.
+        darkest: uint8 [H, C, W], least level within half a pixel to either side.
+        brightest: uint8 [H, C, W], greatest level within half a pixel to either side.
         prior: uint16, the network's disparity minus first_px in 1/SUBSTEPS px, up to 8191 px.
         trust: uint16, weight of the prior, 0..MOST_TRUST.
     """
 
     grey: np.ndarray
     census: np.ndarray
-    colour: np.ndarray
+    levels: np.ndarray
     darkest: np.ndarray
     brightest: np.ndarray
     prior: np.ndarray
@@ -126,27 +127,18 @@ def _difference(level, dark, bright, there, dark_there, bright_there):
 
 @inlined
 @typing.no_type_check
-def _differences(level, dark, bright, levels, darks, brights, costs):
-    """Write half the colour difference of each candidate into costs; the inputs are tuples of channels."""
+def _add_differences(level, dark, bright, levels, darks, brights, costs):
+    """Add a channel's difference to each candidate's cost."""
     for i in range(costs.shape[0]):
-        red = _difference(level[0], dark[0], bright[0], levels[0][i], darks[0][i], brights[0][i])
-        green = _difference(level[1], dark[1], bright[1], levels[1][i], darks[1][i], brights[1][i])
-        blue = _difference(level[2], dark[2], bright[2], levels[2][i], darks[2][i], brights[2][i])
-        costs[i] = np.uint8(np.uint8(red + green + blue) >> np.uint8(1))
+        costs[i] = np.uint8(costs[i] + _difference(level, dark, bright, levels[i], darks[i], brights[i]))
 
 
 @inlined
 @typing.no_type_check
-def _at(channels, y, x):
-    """Return the three levels of a pixel; `channels` is [H, 3, W]."""
-    return channels[y, 0, x], channels[y, 1, x], channels[y, 2, x]
-
-
-@inlined
-@typing.no_type_check
-def _along(channels, y, start, end):
-    """Return the three channels of columns start..end in row y; `channels` is [H, 3, W]."""
-    return channels[y, 0, start:end], channels[y, 1, start:end], channels[y, 2, start:end]
+def _weigh(weight, costs):
+    """Multiply each candidate's cost by half the weight."""
+    for i in range(costs.shape[0]):
+        costs[i] = np.uint8(np.uint8(costs[i] * weight) >> np.uint8(1))
 
 
 @inlined
@@ -214,7 +206,8 @@ def match(own, other, search, towards, levels, first, last, costs):
     of all candidates.
     """
     places, firsts = search
-    width = places.shape[1]
+    width, channels = places.shape[1], own.levels.shape[1]
+    weight = np.uint8(_COLOURS // channels)
     for y in range(first, last):
         for x in range(width):
             place = places[y, x]
@@ -225,15 +218,18 @@ def match(own, other, search, towards, levels, first, last, costs):
             start = skipped + (x if towards > 0 else width - 1 - x)
             end = start + count
             out = costs[place : place + count]
-            _differences(
-                _at(own.colour, y, x),
-                _at(own.darkest, y, x),
-                _at(own.brightest, y, x),
-                _along(other.colour, y, start, end),
-                _along(other.darkest, y, start, end),
-                _along(other.brightest, y, start, end),
-                out,
-            )
+            out[:] = 0
+            for i in range(channels):
+                _add_differences(
+                    own.levels[y, i, x],
+                    own.darkest[y, i, x],
+                    own.brightest[y, i, x],
+                    other.levels[y, i, start:end],
+                    other.darkest[y, i, start:end],
+                    other.brightest[y, i, start:end],
+                    out,
+                )
+            _weigh(weight, out)
             _add_census(own.census[y, x], other.census[y, start:end], out)
             priors, trusts = other.prior[y, start:end], other.trust[y, start:end]
             _add_pulls(own.prior[y, x], own.trust[y, x], priors, trusts, skipped, out)

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
+from stereoweave.matching.exposure import fit_grey
 from stereoweave.stereo import Estimate
 from stereoweave.system.threads import in_bands, thread_count
 
@@ -24,7 +25,6 @@ _EDGE_PX, _EDGE_PLACES = 0.5, 5
 _REACH_PX = 24
 _LEAST_BAND_PX = 64
 _BAND_PIXELS = 2_000_000
-_GAIN_STEP_PX = 4
 
 
 def to_subpixel(
@@ -56,7 +56,7 @@ def to_subpixel(
     from stereoweave.matching.subpixel_kernels import change  # it loads LLVM
 
     here, there = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (left, right))
-    gain = _gain(here, there, estimate)
+    gain, _ = fit_grey(here, there, estimate)
     here, there = _pad_to_even(here), _pad_to_even(there)
     given_px = _pad_to_even(np.require(estimate.disparity_px, np.float32, ["C", "W"]))
     occluded = _pad_to_even(estimate.occluded.astype(np.uint8))
@@ -86,21 +86,6 @@ def _pad_to_even(values: np.ndarray) -> np.ndarray:
     if height % 2 == width % 2 == 0:
         return values
     return cv2.copyMakeBorder(values, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
-
-
-def _gain(here: UInt8[np.ndarray, "h w"], there: UInt8[np.ndarray, "h w"], estimate: Estimate) -> float:
-    """Return the ratio of left to right contrast, measured on a sample of the visible pixels."""
-    some = np.s_[::_GAIN_STEP_PX, ::_GAIN_STEP_PX]
-    visible = ~estimate.occluded[some]
-    if not visible.any():
-        return 1.0
-    columns = np.arange(0, here.shape[1], _GAIN_STEP_PX, dtype=np.float32)
-    matches = np.rint(columns - estimate.disparity_px[some]).clip(0, here.shape[1] - 1)
-    seen = here[some], np.take_along_axis(there[::_GAIN_STEP_PX], matches.astype(np.intp), 1)
-    deviations = (cv2.meanStdDev(values, mask=visible.view(np.uint8))[1].item() for values in seen)
-    # At least 1, for images without contrast.
-    own, other = (max(deviation, 1.0) for deviation in deviations)
-    return own / other
 
 
 def _find_change(

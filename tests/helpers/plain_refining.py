@@ -13,9 +13,9 @@ def plain_costs(own, other, first_px, count):
     for i in range(count):
         columns = np.clip(np.arange(width) - first_px - i, 0, width - 1)
         there = type(own)(*(cue[..., columns].astype(int) for cue in other))
-        one = np.maximum(here.colour - there.brightest, there.darkest - here.colour)
-        two = np.maximum(there.colour - here.brightest, here.darkest - there.colour)
-        differences = np.clip(np.minimum(one, two), 0, 40).sum(1)
+        one = np.maximum(here.levels - there.brightest, there.darkest - here.levels)
+        two = np.maximum(there.levels - here.brightest, here.darkest - there.levels)
+        differences = np.clip(np.minimum(one, two), 0, 40).sum(1) * (3 // one.shape[1])
         bits = np.bitwise_count(here.census ^ there.census)
         pulls = (np.clip(abs(view.prior - 8 * i) - 8, 0, 64) * view.trust // 64 for view in (here, there))
         volume[..., i] = 2 * bits + differences // 2 + sum(pulls)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stereoweave.io.images import read_image
-from stereoweave.matching.exposure import Looks, match_exposure, recolour
+from stereoweave.matching.exposure import Looks, equalise_grey, match_exposure, recolour
 from stereoweave.matching.matcher import Matcher
 from stereoweave.stereo import Estimate, StereoPair
 from stereoweave.synth.rendering.effects import PLAIN
@@ -263,3 +263,22 @@ def test_levels_are_rounded_and_an_images_own_look_changes_nothing(examples):
     table[[7, 8, 255]] = [[1.4, 1.6, 2.0], [3.4, 3.6, 4.0], [254.4, 254.6, 255.0]]
     photo = np.array([[[7, 7, 7], [8, 8, 8], [255, 255, 255]]], np.uint8)
     assert recolour(photo, table).tolist() == [[[1, 2, 2], [3, 4, 4], [254, 255, 255]]]
+
+
+@pytest.mark.parametrize(("gain", "offset"), [(1, 0), (0.5, 40), (1.5, -30)])
+def test_grey_levels_get_the_mean_and_the_contrast_of_the_left_picture(gain, offset):
+    row = np.arange(60, 188, 2, dtype=np.uint8)
+    grey = np.repeat(row[None], 64, axis=0)
+    right = np.repeat(grey[..., None], 3, axis=2)
+    left = np.rint(gain * np.roll(right, SHIFT_PX, 1) + offset).astype(np.uint8)
+    estimate = replace(seen_alike(64, 64), occluded=np.tile(np.arange(64) < SHIFT_PX, (64, 1)))
+    _, equalised = equalise_grey(StereoPair(left=left, right=right), estimate)
+    np.testing.assert_allclose(equalised, gain * grey + offset, atol=1)
+
+
+def test_grey_levels_without_visible_pixels_stay(rng):
+    left, right = (rng.integers(0, 256, (64, 64, 3), np.uint8) for _ in range(2))
+    nothing = replace(seen_alike(64, 64), occluded=np.ones((64, 64), bool))
+    greys = equalise_grey(StereoPair(left=left, right=right), nothing)
+    for image, grey in zip((left, right), greys, strict=True):
+        np.testing.assert_array_equal(grey, cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))

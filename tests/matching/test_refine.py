@@ -7,7 +7,7 @@ from stereoweave.errors import StereoweaveError
 from stereoweave.matching import refine as refining
 from stereoweave.matching import refine_kernels as kernels
 from stereoweave.matching.refine import refine, refine_doubtful
-from stereoweave.stereo import Estimate, StereoPair
+from stereoweave.stereo import Estimate
 
 FAR_PX, NEAR_PX, STICK_PX = 6, 16, 12
 STICK = slice(60, 65)
@@ -202,8 +202,11 @@ def random_pair(rng):
     return left, right, Estimate(**vars(given) | {"confidence": confidence})
 
 
-def test_the_kernels_equal_the_plain_ones(rng):
+@pytest.mark.parametrize("in_colour", [True, False])
+def test_the_kernels_equal_the_plain_ones(rng, in_colour):
     left, right, given = random_pair(rng)
+    if not in_colour:
+        left, right = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (left, right))
     first_px, count = refining._candidates(given)
     own = refining._cues(left, given.disparity_px - first_px, given.confidence)
     right_trust = refining.right_confidence(given)
@@ -218,9 +221,7 @@ def test_the_kernels_equal_the_plain_ones(rng):
     kernels.match(own, refining._align(other, first_px, count, -1), search, -1, count, 0, 24, costs)
     expected = plain_costs(own, other, first_px, count)
     np.testing.assert_array_equal(costs, expected[searched].ravel())
-    found_px, _ = refining._match_views(
-        StereoPair(left=left, right=right), given, refining.WIDE, right_trust, 1
-    )
+    found_px, _ = refining._match_views((left, right), given, refining.WIDE, right_trust, 1)
     expected_px = plain_pick(plain_sums(expected, own, searched), first_px)
     np.testing.assert_allclose(found_px[searched], expected_px[searched], atol=1e-5)
     np.testing.assert_allclose(found_px[~searched], given.disparity_px[~searched], atol=1 / 16)
@@ -232,7 +233,7 @@ def test_each_tile_searches_from_the_least_disparity_of_the_tiles_around(rng, mo
     maps_px = [np.repeat(rng.uniform(0, 9, (140, 60)), 5, 1) + moved_px for _ in range(2)]
     for view_px in maps_px:
         view_px[64:, 200:] += 50
-    pair, given = StereoPair(left=left, right=right), estimate_of(*maps_px)
+    given = estimate_of(*maps_px)
     given.confidence[:, 120:140] = 0.9
     first_px, count = refining._candidates(given)
     right_trust = refining.right_confidence(given)
@@ -241,7 +242,7 @@ def test_each_tile_searches_from_the_least_disparity_of_the_tiles_around(rng, mo
     searched = refining.find_searched(given.confidence, refining.WIDE)
     costs = plain_costs(own, other, first_px, count)
     expected_px = plain_pick(plain_sums(costs, own, searched), first_px)
-    found_px, _ = refining._match_views(pair, given, refining.WIDE, right_trust, 2)
+    found_px, _ = refining._match_views((left, right), given, refining.WIDE, right_trust, 2)
     np.testing.assert_allclose(found_px[searched], expected_px[searched], atol=1e-5)
     # The last tile row sees no disparity below 50 px, neither in its own tiles nor in those around.
     assert found_px[128:, 256:].min() > 30 + moved_px
@@ -250,7 +251,7 @@ def test_each_tile_searches_from_the_least_disparity_of_the_tiles_around(rng, mo
 def test_both_views_settle_as_the_plain_ones(rng):
     left, right, given = random_pair(rng)
     right_trust = refining.right_confidence(given)
-    found_px = refining._match_views(StereoPair(left=left, right=right), given, refining.WIDE, right_trust, 1)
+    found_px = refining._match_views((left, right), given, refining.WIDE, right_trust, 1)
     refined = refine(left, right, given)
     expected = plain_settled(given.disparity_px, *found_px, given.confidence, -1)
     np.testing.assert_array_equal(refined.disparity_px, expected)
@@ -264,14 +265,15 @@ def test_a_right_view_is_matched_as_the_left_one_of_the_mirrored_pair(scene, mon
     monkeypatch.setattr(refining, "_COARSE", np.float32(1))
     monkeypatch.setattr(refining, "find_matches_of_found", lambda _, found_px, __: found_px < -1e9)
     left, right, _, right_px = scene
-    pair, given = StereoPair(left=left, right=right), estimate_of(right_px, right_px, confidence=0)
+    given = estimate_of(right_px, right_px, confidence=0)
     trust = np.zeros(right_px.shape, np.float32)
     trust[10:30, 30:100] = 0.9
     given = Estimate(**vars(given) | {"confidence": trust})
-    found_px, right_found_px = refining._match_views(pair, given, refining.WIDE, trust, 1)
+    found_px, right_found_px = refining._match_views((left, right), given, refining.WIDE, trust, 1)
     turned = {name: values[:, ::-1].copy() for name, values in vars(given).items() if name in MAPS}
+    images = right[:, ::-1].copy(), left[:, ::-1].copy()
     mirrored_px, right_mirrored_px = refining._match_views(
-        pair.mirror(), Estimate(**vars(given) | turned), refining.WIDE, trust[:, ::-1].copy(), 1
+        images, Estimate(**vars(given) | turned), refining.WIDE, trust[:, ::-1].copy(), 1
     )
     np.testing.assert_array_equal(mirrored_px[:, ::-1], right_found_px)
     np.testing.assert_array_equal(right_mirrored_px[:, ::-1], found_px)
