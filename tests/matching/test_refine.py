@@ -103,7 +103,7 @@ def test_the_right_view_is_searched_around_the_matches_of_newly_found_left_dispa
     np.testing.assert_array_equal(refining.find_matches_of_found(disparity_px, found_px, 4), expected)
 
 
-@pytest.mark.parametrize(("confidence", "share_found"), [(0.4, 0), (0.39, 0.95)])
+@pytest.mark.parametrize(("confidence", "share_found"), [(0.45, 0), (0.44, 0.95)])
 def test_only_doubtful_disparities_are_replaced_without_a_wide_search(scene, confidence, share_found):
     left, right, left_px, right_px = scene
     given = estimate_of(*without_stick(left_px, right_px), confidence=confidence)
@@ -116,7 +116,7 @@ def test_only_doubtful_disparities_are_replaced_without_a_wide_search(scene, con
 
 def test_pixels_up_to_2_px_from_doubtful_ones_are_searched():
     confidence = np.full((9, 12), 0.5, np.float32)
-    confidence[4, 6] = 0.39
+    confidence[4, 6] = 0.44
     expected = np.zeros((9, 12), bool)
     expected[2:7, 4:9] = True
     np.testing.assert_array_equal(refining.find_searched(confidence, refining.NARROW), expected)
