@@ -18,10 +18,11 @@ from stereoweave.errors import Note, Remedy, StereoweaveError
 from stereoweave.io.images import SMALLEST_SIDE_PX
 from stereoweave.matching.disparity_range import find_range, goes_beyond
 from stereoweave.matching.edge_vote.vote import rehearse_voting
-from stereoweave.matching.left_right_check import at_match, find_occluded
+from stereoweave.matching.left_right_check import find_occluded
 from stereoweave.matching.matcher import (
     PIXEL_PAIRS_AT_ONCE,
     Matcher,
+    apply_masks,
     rehearse_finishing,
 )
 from stereoweave.matching.options import DEFAULT_OPTIONS, OMIT_RANGE, MatchOptions
@@ -154,14 +155,14 @@ def _finish(
     if matcher.magnification > 1:
         small, found = _match_magnified(matcher, pair, small, found)
     if not options.raw:
-        found = matcher.finish(small, _apply_masks(found, small), refined=options.refined)
+        found = matcher.finish(small, apply_masks(found, small), refined=options.refined)
     if small.left.shape[1] > pair.left.shape[1]:
         found = _downsample(found, pair)
     elif small.left.shape != pair.left.shape:
         found = enlarge(pair.left, pair.right, found, matcher.threads)
     if options.range_px is not None:
         found = _clip(found, *options.range_px)
-    return _apply_masks(found, pair)
+    return apply_masks(found, pair)
 
 
 def _fit_network(matcher: Matcher, pair: StereoPair) -> StereoPair:
@@ -398,14 +399,3 @@ def _clip(found: Estimate, low_px: float, high_px: float) -> Estimate:
         right_disparity_px=np.clip(found.right_disparity_px, low_px, high_px),
         confidence=np.where(outside, np.float32(0), found.confidence),
     )
-
-
-def _apply_masks(found: Estimate, pair: StereoPair) -> Estimate:
-    """Apply the content masks to the confidence and the occlusion mask, as described in `match`."""
-    confidence, occluded = found.confidence, found.occluded
-    if pair.left_seen is not None:
-        confidence = np.where(pair.left_seen, confidence, np.float32(0))
-    if pair.right_seen is not None:
-        seen, _ = at_match(pair.right_seen.astype(np.uint8), found.disparity_px, -1)
-        occluded = occluded | (seen == 0)
-    return replace(found, confidence=confidence, occluded=occluded)

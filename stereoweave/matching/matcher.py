@@ -6,6 +6,7 @@ output `disparity_px`, and the optional outputs `right_disparity_px` and `confid
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from importlib.resources import files
 from itertools import pairwise
 from pathlib import Path
@@ -20,7 +21,12 @@ from stereoweave.errors import MatcherError, StereoweaveError
 from stereoweave.io.images import SMALLEST_SIDE_PX
 from stereoweave.matching.contrast import measure_contrast
 from stereoweave.matching.edge_vote.vote import sharpen_edges, vote_at_edges
-from stereoweave.matching.left_right_check import find_contradicted, is_occluded, measure_disagreement
+from stereoweave.matching.left_right_check import (
+    at_match,
+    find_contradicted,
+    is_occluded,
+    measure_disagreement,
+)
 from stereoweave.matching.network import Network
 from stereoweave.matching.occlusion_fill import fill_occluded
 from stereoweave.matching.options import MatchOptions
@@ -63,7 +69,7 @@ class Mode(NamedTuple):
 
 
 MODES = {"base": Mode(network="base"), "best": Mode(network="base", magnification=1.5, voted=True)}
-"""Modes by name; both refine widely. `best` is for stills: it improves edges but is much slower."""
+"""Modes by name; both refine every estimate. `best` is for stills: it improves edges but is much slower."""
 
 
 class Maps(NamedTuple):
@@ -79,7 +85,7 @@ class Matcher:
 
     Args:
         model: Name of a shipped network (`shipped_models`) or of a mode in `MODES`, or the path of an .onnx
-            file, whose estimates are refined widely on request only.
+            file, whose estimates are refined on request only.
         threads: Maximum number of threads per call; default: all cores available to the process.
         provider: Execution provider, a name in `providers.PROVIDERS`.
 
@@ -88,7 +94,7 @@ class Matcher:
         fixed_size: Height and width of a network with a fixed input size; None if it accepts any size.
         magnification: Greatest factor by which `match` magnifies pairs for the network; `estimate` ignores
             it.
-        refines: Whether every estimate is refined widely.
+        refines: Whether every estimate is refined as on request.
         votes: Whether edges, speckles and unsure disparities are corrected by vote.
 
     Raises:
@@ -180,12 +186,12 @@ class Matcher:
 
         The pair is matched once more where the network is unsure; if `refined` or the matcher's mode requests
         it, wherever the network is not certain. Visible disparities are then refined to a fraction of a
-        pixel, occluded pixels filled and streaks beyond the other picture smoothed. Estimates that are
-        refined on request finally get edges that follow the image.
+        pixel, occluded pixels filled and streaks beyond the other picture smoothed. Refined estimates finally
+        get edges that follow the image.
         """
         refined = refined or self.refines
         search = refine if refined else refine_doubtful
-        found = search(pair.left, pair.right, found, self.threads)
+        found = apply_masks(search(pair.left, pair.right, found, self.threads), pair)
         found = to_subpixel(pair.left, pair.right, found, self.threads)
         found = smooth_streaks(fill_occluded(found, pair.left_seen))
         if self.votes:
@@ -338,6 +344,17 @@ class Matcher:
             f"{self._path}: expected a matcher's metadata, found {found}; "
             "create the file with `stereoweave export`"
         )
+
+
+def apply_masks(found: Estimate, pair: StereoPair) -> Estimate:
+    """Apply the content masks to the confidence and the occlusion mask, as described in `estimate.match`."""
+    confidence, occluded = found.confidence, found.occluded
+    if pair.left_seen is not None:
+        confidence = np.where(pair.left_seen, confidence, np.float32(0))
+    if pair.right_seen is not None:
+        seen, _ = at_match(pair.right_seen.astype(np.uint8), found.disparity_px, -1)
+        occluded = occluded | (seen == 0)
+    return replace(found, confidence=confidence, occluded=occluded)
 
 
 def rehearse_finishing() -> None:

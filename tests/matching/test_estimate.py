@@ -315,15 +315,19 @@ def test_masks_are_downscaled_with_the_pictures(rng):
     np.testing.assert_array_equal(small.left_seen[:, [59, 60]], np.tile([False, True], (80, 1)))
 
 
-def test_pixels_without_content_have_no_confidence_and_occlude_their_matches(matcher, rng):
+@pytest.mark.parametrize("refined", [False, True])
+def test_pixels_without_content_have_no_confidence_and_occlude_their_matches(matcher, rng, refined):
     pair = flat(rng, 37)
     left_seen, right_seen = np.ones((2, *pair.left.shape[:2]), bool)
     left_seen[:, :100] = False
     right_seen[:, 300:320] = False
-    found = match(matcher, replace(pair, left_seen=left_seen, right_seen=right_seen))
+    pair.right[~right_seen] = 0
+    options = MatchOptions(refined=refined)
+    found = match(matcher, replace(pair, left_seen=left_seen, right_seen=right_seen), options)
     assert (found.confidence[:, :100] == 0).all()
     assert np.median(found.confidence[:, 120:]) > 0.9
     assert found.occluded[20:-20, 338:356].mean() > 0.98
+    np.testing.assert_allclose(found.disparity_px[20:-20, 338:356], 37, atol=1.5)
     assert found.occluded[20:-20, 120:330].mean() < 0.02
 
 
