@@ -3,7 +3,7 @@
 import os
 from collections import deque
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextvars import copy_context
 from itertools import pairwise
 from typing import TypeVar
@@ -15,6 +15,16 @@ Result = TypeVar("Result")
 
 _MOST_THREADS = 1024
 _pool = ThreadPoolExecutor(_MOST_THREADS)
+
+
+def _renew_pool() -> None:
+    global _pool
+    _pool = ThreadPoolExecutor(_MOST_THREADS)
+
+
+# A forked child has none of its parent's threads.
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_renew_pool)
 
 
 def thread_count(threads: int | None) -> int:
@@ -56,8 +66,10 @@ def in_bands(work: Callable[[int, int], None], height: int, count: int, threads:
             work(*band)
 
     # With the caller's context variables, such as the listener to its steps.
-    others = [_pool.submit(copy_context().run, work_off) for _ in range(min(threads, count) - 1)]
+    others: list[Future[None]] = []
     try:
+        for _ in range(min(threads, count) - 1):
+            others.append(_pool.submit(copy_context().run, work_off))
         work_off()
     finally:
         bands.clear()  # after an error

@@ -1,3 +1,4 @@
+import multiprocessing
 import os
 import threading
 from contextvars import ContextVar
@@ -38,9 +39,22 @@ def test_bands_cover_all_rows_once_in_the_caller_s_context():
     assert sorted(seen) == [(0, 2, 7), (2, 5, 7), (5, 7, 7), (7, 10, 7)]
 
 
-def test_as_many_threads_as_asked_work_on_bands_at_once():
+def meet():
     together = threading.Barrier(3)
     in_bands(lambda *_: together.wait(timeout=20), 3, 3, 3)
+
+
+def test_as_many_threads_as_asked_work_on_bands_at_once():
+    meet()
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")
+def test_a_forked_process_gets_threads_of_its_own():
+    meet()
+    child = multiprocessing.get_context("fork").Process(target=meet)
+    child.start()
+    child.join(60)
+    assert child.exitcode == 0
 
 
 def test_one_thread_works_on_bands_in_turn():
