@@ -71,7 +71,7 @@ class Search(typing.NamedTuple):
 
     Attributes:
         places: int64 [H, W], start of each pixel's candidates in the volumes; -1 where the network's
-            disparity is certain.
+            disparity is not searched.
         firsts: int32, first candidate of each tile.
     """
 
@@ -238,7 +238,7 @@ def match(own, other, search, towards, levels, first, last, costs):
 @inlined
 @typing.no_type_check
 def _start(prior, path):
-    """Write a path's costs at a pixel of certain disparity: 0 within 1 px (DOUBTLESS) of it, else _NEVER."""
+    """Write a path's costs at a pixel that is not searched: 0 within 1 px (DOUBTLESS) of it, else _NEVER."""
     for i in range(path.shape[0] - 2):
         candidate = np.uint16(SUBSTEPS * i)
         away = np.uint16(max(prior, candidate) - min(prior, candidate))

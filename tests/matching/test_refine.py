@@ -6,8 +6,9 @@ from plain_refining import plain_census, plain_costs, plain_pick, plain_settled,
 from stereoweave.errors import StereoweaveError
 from stereoweave.matching import refine as refining
 from stereoweave.matching import refine_kernels as kernels
+from stereoweave.matching.matcher import Matcher
 from stereoweave.matching.refine import refine, refine_doubtful
-from stereoweave.stereo import Estimate
+from stereoweave.stereo import Estimate, StereoPair
 
 FAR_PX, NEAR_PX, STICK_PX = 6, 16, 12
 STICK = slice(60, 65)
@@ -114,6 +115,26 @@ def test_only_doubtful_disparities_are_replaced_without_a_wide_search(scene, con
         np.testing.assert_array_equal(found_px, given.disparity_px)
 
 
+def test_a_matcher_searches_what_is_doubtful_without_being_asked(scene):
+    left, right, left_px, right_px = scene
+    pair, given = StereoPair(left=left, right=right), estimate_of(*without_stick(left_px, right_px))
+    found_px = Matcher("small").finish(pair, given).disparity_px
+    in_left = slice(STICK.start + STICK_PX, STICK.stop + STICK_PX)
+    assert (abs(found_px[:, in_left] - STICK_PX) < 1).mean() > 0.95
+
+
+def test_a_wide_search_covers_all_that_may_be_replaced():
+    assert refining.WIDE.confidence == kernels.CERTAIN
+
+
+def test_an_outlier_far_beyond_the_picture_does_not_widen_the_search_to_it(scene):
+    left, right, left_px, right_px = scene
+    given = estimate_of(np.where(np.isnan(left_px), FAR_PX, left_px), right_px)
+    given.disparity_px[0, 0] = 1e6
+    found = refine_doubtful(left, right, given)
+    assert (abs(found.disparity_px - given.disparity_px)[2:, 20:] < 1).mean() > 0.99
+
+
 def test_pixels_up_to_2_px_from_doubtful_ones_are_searched():
     confidence = np.full((9, 12), 0.5, np.float32)
     confidence[4, 6] = 0.44
@@ -207,7 +228,7 @@ def test_the_kernels_equal_the_plain_ones(rng, in_colour):
     left, right, given = random_pair(rng)
     if not in_colour:
         left, right = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (left, right))
-    first_px, count = refining._candidates(given)
+    first_px, count = refining._candidates(given.disparity_px, given.right_disparity_px)
     own = refining._cues(left, given.disparity_px - first_px, given.confidence)
     right_trust = refining.right_confidence(given)
     other = refining._cues(right, given.right_disparity_px - first_px, np.float32(0.7) * right_trust)
@@ -235,7 +256,7 @@ def test_each_tile_searches_from_the_least_disparity_of_the_tiles_around(rng, mo
         view_px[64:, 200:] += 50
     given = estimate_of(*maps_px)
     given.confidence[:, 120:140] = 0.9
-    first_px, count = refining._candidates(given)
+    first_px, count = refining._candidates(given.disparity_px, given.right_disparity_px)
     right_trust = refining.right_confidence(given)
     own = refining._cues(left, given.disparity_px - first_px, given.confidence)
     other = refining._cues(right, given.right_disparity_px - first_px, np.float32(0.7) * right_trust)
