@@ -80,7 +80,7 @@ def write_submission(
         out: The archive, a new .zip file.
         submission: The pairs and the format.
         backend: The network.
-        refined: Whether to match once more at full resolution.
+        refined: Whether to match once more wherever the network is not certain.
         console: Console that shows the progress.
 
     Raises:

@@ -17,9 +17,8 @@ class MatchOptions:
         range_px: Least and greatest disparity of the left view in px; disparities outside the range are
             clipped, and get confidence 0 if they are outside by more than 1 px. Default: the network's range,
             extended if the pair exceeds it.
-        refined: Match once more at full resolution wherever the network is not certain, not only where it is
-            unsure. This is slower, but recovers more thin structures and sharper edges. `base` and `best`
-            always do.
+        refined: Match once more at full resolution wherever the confidence is below 0.85, instead of 0.45.
+            This is slower, but recovers more thin structures and sharper edges. `base` and `best` always do.
         raw: Return the network's disparity without any refinement and occlusion filling.
 
     Raises:

@@ -32,7 +32,7 @@ class Budget:
 
     Args:
         seconds_each: Seconds per unit of work.
-        refines: Whether every estimate is refined (`Matcher.refines`), so that the option adds no work.
+        refines: Whether the model always refines (`Matcher.refines`), so that the option adds no work.
     """
 
     def __init__(self, seconds_each: float, *, refines: bool = False) -> None:

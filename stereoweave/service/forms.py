@@ -110,7 +110,8 @@ class MapForm(PairForm):
     """Fields of a request for disparity or depth."""
 
     refined: Annotated[
-        bool, Field(description="Match once more at full resolution; base and best always do.")
+        bool,
+        Field(description="Match once more wherever the network is not certain; base and best always do."),
     ] = False
     file: Annotated[
         Literal["png", "pfm", "npy", "tiff"],
