@@ -106,10 +106,12 @@ def match_many(
 
 def _compile_ahead(matcher: Matcher, pairs: Sequence[StereoPair], options: MatchOptions) -> None:
     """Start to compile what follows the network."""
+    refined = options.refined or matcher.refines
     if not options.raw:
-        compile_ahead(rehearse_refining)
         compile_ahead(rehearse_finishing)
-        if options.refined or matcher.refines:
+        if refined or matcher.searches:
+            compile_ahead(rehearse_refining)
+        if refined:
             compile_ahead(rehearse_voting)
     if not all(matcher.sees_whole(*pair.left.shape[1::-1]) for pair in pairs):
         compile_ahead(rehearse_upsampling)

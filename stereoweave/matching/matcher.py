@@ -85,7 +85,7 @@ class Matcher:
 
     Args:
         model: Name of a shipped network (`shipped_models`) or of a mode in `MODES`, or the path of an .onnx
-            file, whose estimates are refined on request only.
+            file, whose estimates are neither searched nor refined unless this is requested.
         threads: Maximum number of threads per call; default: all cores available to the process.
         provider: Execution provider, a name in `providers.PROVIDERS`.
 
@@ -94,6 +94,7 @@ class Matcher:
         fixed_size: Height and width of a network with a fixed input size; None if it accepts any size.
         magnification: Greatest factor by which `match` magnifies pairs for the network; `estimate` ignores
             it.
+        searches: Whether every estimate is searched where the network is unsure.
         refines: Whether every estimate is refined as on request.
         votes: Whether edges, speckles and unsure disparities are corrected by vote.
 
@@ -108,6 +109,7 @@ class Matcher:
         self.threads, self.provider = threads, provider
         mode = MODES.get(str(model))
         self.magnification = mode.magnification if mode else 1.0
+        self.searches = not str(model).endswith(".onnx")
         self.refines = mode is not None
         self.votes = mode is not None and mode.voted
         try:
@@ -138,9 +140,9 @@ class Matcher:
     ) -> Estimate:
         """Estimate both views' disparities, the confidence and the occlusion mask of a rectified pair.
 
-        Where the network is unsure, the pair is matched once more (`refine.refine_doubtful`). The left view's
-        disparity is refined to a fraction of a pixel (`subpixel.to_subpixel`). Occluded pixels are filled
-        with the disparity of the background (`occlusion_fill.fill_occluded`).
+        Where a named network is unsure, the pair is matched once more (`refine.refine_doubtful`). The left
+        view's disparity is refined to a fraction of a pixel (`subpixel.to_subpixel`). Occluded pixels are
+        filled with the disparity of the background (`occlusion_fill.fill_occluded`).
 
         Args:
             left: Left image, uint8 RGB [H, W, 3].
@@ -184,14 +186,15 @@ class Matcher:
     def finish(self, pair: StereoPair, found: Estimate, *, refined: bool = False) -> Estimate:
         """Post-process the network's estimate.
 
-        The pair is matched once more where the network is unsure; if `refined` or the matcher's mode requests
-        it, wherever the network is not certain. Visible disparities are then refined to a fraction of a
-        pixel, occluded pixels filled and streaks beyond the other picture smoothed. Refined estimates finally
-        get edges that follow the image.
+        The pair is matched once more where a named network is unsure; if `refined` or the matcher's mode
+        requests it, wherever the network is not certain. Visible disparities are then refined to a fraction
+        of a pixel, occluded pixels filled and streaks beyond the other picture smoothed. Refined estimates
+        finally get edges that follow the image.
         """
         refined = refined or self.refines
-        search = refine if refined else refine_doubtful
-        found = apply_masks(search(pair.left, pair.right, found, self.threads), pair)
+        if refined or self.searches:
+            search = refine if refined else refine_doubtful
+            found = apply_masks(search(pair.left, pair.right, found, self.threads), pair)
         found = to_subpixel(pair.left, pair.right, found, self.threads)
         found = smooth_streaks(fill_occluded(found, pair.left_seen))
         if self.votes:

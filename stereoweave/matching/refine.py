@@ -49,6 +49,11 @@ _COARSE = np.float32(0.7)
 # matches agree there too.
 _CONFIRMED = np.float32(0.7)
 _TEXTURE_MEAN_PX, _TEXTURE_PX, _TEXTURE_LEVELS = 3, 5, 8
+# ... and where the pictures differ by no more than this share of the contrast; in noise, and between pictures
+# of two scenes, that is rare, although their views may agree.
+_LITTLE_DIFFERENCE = np.float32(0.4)
+# Factor on the confidence where they differ by more than this share.
+_MUCH_DIFFERENCE, _UNLIKE = np.float32(0.8), np.float32(0.7)
 _MOST_THREADS = 4
 
 
@@ -108,8 +113,8 @@ def refine(
 
     The network's disparity is kept where matching confirms it to within 1 px (the network is then more
     precise), where the left view's confidence is high, and where the two views disagree. The confidence is at
-    least 0.7 where the refined views agree on texture, but 0 stays 0. Different exposures are equalised
-    first.
+    least 0.7 where the refined views agree on texture and the pictures are alike there, but 0 stays 0; it is
+    lowered where they are unlike. Different exposures are equalised first.
 
     Args:
         left: Left image, uint8 RGB [H, W, 3].
@@ -153,14 +158,35 @@ def _refine(
     )
     disagreement_px, inside = measure_disagreement(disparity_px, right_disparity_px)
     agreed = inside & (np.abs(disagreement_px) <= _SAME_PX)
+    occluded = is_occluded(disagreement_px, inside)
+    alike, unlike = _compare_at_match(left, images, disparity_px)
+    confidence = np.where(unlike & ~occluded, _UNLIKE * trust, trust)
     # A confidence of 0 marks pixels without content or texture.
-    textured = measure_contrast(left, _TEXTURE_MEAN_PX, _TEXTURE_PX) >= _TEXTURE_LEVELS
-    confirmed = agreed & (estimate.confidence > 0) & textured
+    confirmed = agreed & (trust > 0) & alike
     return Estimate(
         disparity_px=disparity_px,
         right_disparity_px=right_disparity_px,
-        confidence=np.where(confirmed, np.maximum(estimate.confidence, _CONFIRMED), estimate.confidence),
-        occluded=is_occluded(disagreement_px, inside),
+        confidence=np.where(confirmed, np.maximum(confidence, _CONFIRMED), confidence),
+        occluded=occluded,
+    )
+
+
+def _compare_at_match(
+    left: UInt8[np.ndarray, "h w 3"],
+    images: tuple[UInt8[np.ndarray, "h w *c"], UInt8[np.ndarray, "h w *c"]],
+    disparity_px: Float32[np.ndarray, "h w"],
+) -> tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    """Return the masks of textured pixels that differ little and much from their match in `images`."""
+    contrast = measure_contrast(left, _TEXTURE_MEAN_PX, _TEXTURE_PX)
+    here, there = (x if x.ndim == 2 else cv2.cvtColor(x, cv2.COLOR_RGB2GRAY) for x in images)
+    columns = np.arange(here.shape[1], dtype=np.float32) - disparity_px
+    rows = np.broadcast_to(np.arange(len(here), dtype=np.float32)[:, None], columns.shape)
+    seen = cv2.remap(there, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    difference = cv2.blur(cv2.absdiff(here, seen), (_TEXTURE_PX, _TEXTURE_PX))
+    textured = contrast >= _TEXTURE_LEVELS
+    return (
+        textured & (difference <= _LITTLE_DIFFERENCE * contrast),
+        textured & (difference > _MUCH_DIFFERENCE * contrast),
     )
 
 

@@ -239,9 +239,12 @@ def test_the_rows_show_the_effect_of_the_temporal_filter():
     for by_frame, steady, carried in zip(rows[::3], rows[1::3], rows[2::3], strict=True):
         assert carried.flicker_px < steady.flicker_px < by_frame.flicker_px
         assert max(carried.jumps_share, steady.jumps_share) < by_frame.jumps_share
-        assert steady.epe_px < 1.01 * by_frame.epe_px
+        # A surface that the search finds in one frame is taken over after several: these are only four.
+        assert steady.epe_px < 1.06 * by_frame.epe_px
         assert carried.epe_px < 1.03 * by_frame.epe_px
         assert min(steady.time_ms, carried.time_ms) > 0
+    by_frame_px, steady_px, carried_px = (np.mean([row.epe_px for row in rows[i::3]]) for i in range(3))
+    assert carried_px < steady_px < by_frame_px
     # Views are rendered without the exposure, so a fade alone changes none.
     assert rows[15].view_flicker_levels < 1.5 * rows[9].view_flicker_levels
     passing_by_frame, passing_steady = rows[3:5]

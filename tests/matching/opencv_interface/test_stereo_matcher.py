@@ -71,8 +71,8 @@ def test_valid_pixels_are_the_estimate_times_16_and_others_are_marked():
     left, right = photographs()
     pair = read_pair(TEXTURED / "left.png", TEXTURED / "right.png")
     estimate = match(Matcher(), pair, MatchOptions(range_px=(0, 64)))
-    disparity = StereoMatcher(0, 64, min_confidence=0.5).compute(left, right)
-    known = ~estimate.occluded & (estimate.confidence >= 0.5)
+    disparity = StereoMatcher(0, 64, min_confidence=0.8).compute(left, right)
+    known = ~estimate.occluded & (estimate.confidence >= 0.8)
     known &= (estimate.disparity_px >= 0) & (estimate.disparity_px <= 64)
     assert 0.05 < 1 - known.mean() < 0.5
     np.testing.assert_allclose(disparity[known] / 16, estimate.disparity_px[known], atol=1 / 32)
