@@ -21,8 +21,10 @@ def run(source, out, *words):
 
 def write_hdr(path, pairs, *, transfer=HLG, primaries=BT2020, pix_fmt="yuv420p10le", matrix=BT2020):
     """Write packed pairs as HEVC of 10 bits, whose codes are those of the pictures."""
+    # With B-frames, x265 gives a video of one or two frames random decoding times, which MP4 cannot store.
+    parameters = "bframes=0:log-level=error"
     with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx265", 25, {"crf": "4", "x265-params": "log-level=error"})
+        stream = container.add_stream("libx265", 25, {"crf": "4", "x265-params": parameters})
         stream.pix_fmt = pix_fmt
         stream.color_range, stream.colorspace = 1, matrix
         stream.color_primaries, stream.color_trc = primaries, transfer
