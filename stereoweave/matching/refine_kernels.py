@@ -278,35 +278,35 @@ def along_rows(costs, own, search, large_step, levels, first, last, sums):
     number of all candidates.
     """
     places, firsts = search
-    width = places.shape[1]
-    paths = np.empty((2, levels + 2), np.uint16)
+    width, size = places.shape[1], levels + 2
+    # Both paths of a row advance in turn, so that the processor computes them at once.
+    paths, leasts = np.empty((2, 2, size), np.uint16), np.empty(2, np.uint16)
     for y in range(first, last):
-        for backwards in range(2):
-            paths[:] = 0
-            paths[:, 0] = paths[:, levels + 1] = _NEVER
-            least = np.uint16(0)
-            for i in range(width):
+        paths[:] = 0
+        paths[:, :, 0] = paths[:, :, levels + 1] = _NEVER
+        leasts[:] = 0
+        for i in range(width):
+            for backwards in range(2):
                 x = width - 1 - i if backwards else i
                 place = places[y, x]
                 if place < 0:
                     continue
                 skipped = firsts[y // TILE_PX, x // TILE_PX]
-                before, after = paths[i & 1], paths[1 - (i & 1)]
+                before, after = paths[backwards, i & 1], paths[backwards, 1 - (i & 1)]
                 x_before = x - 1 + 2 * backwards
                 if i > 0 and places[y, x_before] < 0:
                     _start(own.prior[y, x_before], before)
-                    least = np.uint16(0)
+                    leasts[backwards] = 0
                 elif i > 0 and x_before // TILE_PX != x // TILE_PX:
                     _close(before, firsts[y // TILE_PX, x_before // TILE_PX])
                 end = place + levels - skipped
-                if not backwards:
+                if 2 * i + backwards < width:  # the first path to arrive here
                     sums[place:end] = 0
-                jump = large_step[y, min(x + backwards, width - 1)]
-                least = _step(
+                leasts[backwards] = _step(
                     before[skipped:],
-                    least,
+                    leasts[backwards],
                     costs[place:end],
-                    jump,
+                    large_step[y, min(x + backwards, width - 1)],
                     after[skipped:],
                     sums[place:end],
                 )
