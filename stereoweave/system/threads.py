@@ -1,12 +1,15 @@
-"""The number of threads to use, and parallel work on bands of image rows."""
+"""The number of threads to use, and parallel work, on bands of image rows or of other kinds."""
 
 import os
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextvars import copy_context
 from itertools import pairwise
-from typing import TypeVar
+from typing import Any, TypeVar
+
+import numpy as np
+from jaxtyping import Int
 
 from stereoweave.arguments import check_whole_number
 from stereoweave.errors import StereoweaveError
@@ -55,7 +58,25 @@ def in_bands(work: Callable[[int, int], None], height: int, count: int, threads:
     The other threads are kept for the next call, because to start one may take longer than a band. They may
     be at work for other callers; this thread then works through the bands alone.
     """
-    bands = deque(pairwise(height * band // count for band in range(count + 1)))
+    _work_through(work, [height * band // count for band in range(count + 1)], threads)
+
+
+def in_even_bands(work: Callable[[int, int], None], amounts: Int[np.ndarray, " n"], threads: int) -> None:
+    """Call `work` for one band per thread, as `in_bands` does; all bands have about the same work.
+
+    Args:
+        work: Function of the first and the end row of a band.
+        amounts: The amount of work in each row.
+        threads: Number of threads.
+    """
+    done = np.cumsum(amounts)
+    # A row belongs to the band in which the middle of its work lies.
+    inner = np.searchsorted(done - amounts / 2, done[-1] * np.arange(1, threads) / threads).tolist()
+    _work_through(work, [0, *inner, len(amounts)], threads)
+
+
+def _work_through(work: Callable[[int, int], None], ends: Sequence[int], threads: int) -> None:
+    bands = deque(pairwise(ends))
 
     def work_off() -> None:
         while True:
@@ -68,7 +89,7 @@ def in_bands(work: Callable[[int, int], None], height: int, count: int, threads:
     # With the caller's context variables, such as the listener to its steps.
     others: list[Future[None]] = []
     try:
-        for _ in range(min(threads, count) - 1):
+        for _ in range(min(threads, len(bands)) - 1):
             others.append(_pool.submit(copy_context().run, work_off))
         work_off()
     finally:
@@ -77,6 +98,18 @@ def in_bands(work: Callable[[int, int], None], height: int, count: int, threads:
         wait(started)
     for other in started:
         other.result()
+
+
+def side_by_side(works: Sequence[Callable[[], Result]], threads: int) -> list[Result]:
+    """Return what each function returns; up to `threads` of them run at once."""
+    results: list[Any] = [None] * len(works)
+
+    def run(first: int, end: int) -> None:
+        for index in range(first, end):
+            results[index] = works[index]()
+
+    in_bands(run, len(works), len(works), threads)
+    return results
 
 
 def beyond_ctrl_c(work: Callable[[], Result]) -> Result:

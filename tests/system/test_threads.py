@@ -3,10 +3,18 @@ import os
 import threading
 from contextvars import ContextVar
 
+import numpy as np
 import pytest
 
 from stereoweave.errors import StereoweaveError
-from stereoweave.system.threads import beyond_ctrl_c, in_bands, thread_count, usable_cores
+from stereoweave.system.threads import (
+    beyond_ctrl_c,
+    in_bands,
+    in_even_bands,
+    side_by_side,
+    thread_count,
+    usable_cores,
+)
 
 
 def test_the_default_number_of_threads_is_the_number_of_usable_cores():
@@ -37,6 +45,29 @@ def test_bands_cover_all_rows_once_in_the_caller_s_context():
     chosen.set(7)
     in_bands(lambda first, end: seen.append((first, end, chosen.get())), 10, 4, 3)
     assert sorted(seen) == [(0, 2, 7), (2, 5, 7), (5, 7, 7), (7, 10, 7)]
+
+
+@pytest.mark.parametrize(
+    ("amounts", "threads", "bands"),
+    [
+        ([2, 2, 2, 2], 2, [(0, 2), (2, 4)]),
+        ([0, 0, 6, 1, 1, 4], 2, [(0, 3), (3, 6)]),
+        ([9, 1, 1, 1], 3, [(0, 0), (0, 1), (1, 4)]),
+        ([0, 0, 0], 2, [(0, 0), (0, 3)]),
+        ([5, 1], 1, [(0, 2)]),
+    ],
+)
+def test_even_bands_cover_all_rows_and_have_about_the_same_work(amounts, threads, bands):
+    seen = []
+    in_even_bands(lambda *rows: seen.append(rows), np.array(amounts), threads)
+    assert sorted(seen) == bands
+
+
+def test_functions_that_wait_for_each_other_run_side_by_side_and_return_in_order():
+    together = threading.Barrier(3)
+    works = [lambda number=number: (together.wait(timeout=20), number)[1] for number in range(3)]
+    assert side_by_side(works, 3) == [0, 1, 2]
+    assert side_by_side([lambda: "alone"], 1) == ["alone"]
 
 
 def meet():
