@@ -233,14 +233,13 @@ def test_a_rendered_pan_looks_the_same_along_its_true_motion():
 
 @pytest.mark.needs_egl
 def test_the_rows_show_the_effect_of_the_temporal_filter():
-    rows = list(score_flicker(["rooms"], frames=4, size_px=(160, 120), seed=3, threads=1))
+    rows = list(score_flicker(["rooms"], frames=8, size_px=(160, 120), seed=3, threads=1))
     assert [row.film for row in rows[::3]] == ["still", "passing", "nearing", "panning", "flash", "fade"]
     assert [row.method for row in rows] == [FRAME_BY_FRAME, STEADY, CARRIED] * 6
     for by_frame, steady, carried in zip(rows[::3], rows[1::3], rows[2::3], strict=True):
         assert carried.flicker_px < steady.flicker_px < by_frame.flicker_px
         assert max(carried.jumps_share, steady.jumps_share) < by_frame.jumps_share
-        # A surface that the search finds in one frame is taken over after several: these are only four.
-        assert steady.epe_px < 1.06 * by_frame.epe_px
+        assert steady.epe_px < 1.01 * by_frame.epe_px
         assert carried.epe_px < 1.03 * by_frame.epe_px
         assert min(steady.time_ms, carried.time_ms) > 0
     by_frame_px, steady_px, carried_px = (np.mean([row.epe_px for row in rows[i::3]]) for i in range(3))
