@@ -9,6 +9,7 @@ network's resolution.
 """
 
 import math
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import cv2
@@ -17,11 +18,11 @@ from jaxtyping import Bool, Float, Float32, Int32, UInt8
 
 from stereoweave.matching.contrast import measure_contrast
 from stereoweave.matching.exposure import equalise_grey, equalise_right
-from stereoweave.matching.left_right_check import at_match, is_occluded, measure_disagreement
+from stereoweave.matching.left_right_check import is_occluded, measure_disagreement
 from stereoweave.matching.step_penalties import penalise_large_steps
 from stereoweave.stereo import Estimate, StereoPair, check_fits
 from stereoweave.system.steps import step
-from stereoweave.system.threads import in_bands, thread_count
+from stereoweave.system.threads import in_even_bands, side_by_side, thread_count
 
 if TYPE_CHECKING:
     from stereoweave.matching.refine_kernels import Cues, Search
@@ -38,8 +39,6 @@ _BESIDE = np.ones((1, 3), np.uint8)
 # A tile's first candidate is the least disparity in it and in the eight tiles around it. Nearer surfaces are
 # searched everywhere, because what the network misses is nearer than what is around it.
 _TILES_AROUND = np.ones((3, 3), np.uint8)
-# Factor on a pixel's confidence where the network's disparities for the two views disagree.
-_DOUBTED = 0.2
 _SAME_PX = 1.0
 # Factor on the confidence of the right view's disparities, because those of the shipped networks lack the
 # last refinement (decision 0035). None then reaches CERTAIN, so any of them that is searched may be replaced.
@@ -149,17 +148,27 @@ def _refine(
     pair = StereoPair(left=left, right=right)
     check_fits(estimate, pair)
     images = (left, equalise_right(pair, estimate)) if extent.in_colour else equalise_grey(pair, estimate)
-    trust, right_trust = np.asarray(estimate.confidence, np.float32, order="C"), right_confidence(estimate)
     count = min(_MOST_THREADS, thread_count(threads))
+    trust = np.asarray(estimate.confidence, np.float32, order="C")
+    right_trust = right_confidence(estimate)
     found_px, right_found_px = _match_views(images, estimate, extent, right_trust, count)
-    disparity_px = _settle(estimate.disparity_px, found_px, right_found_px, trust, -1)
-    right_disparity_px = _settle(
-        estimate.right_disparity_px, right_found_px, found_px, _COARSE * right_trust, 1
+    right_px = estimate.right_disparity_px
+    disparity_px, right_disparity_px = side_by_side(
+        [
+            partial(_settle, estimate.disparity_px, found_px, right_found_px, trust, -1),
+            partial(_settle, right_px, right_found_px, found_px, _COARSE * right_trust, 1),
+        ],
+        count,
     )
-    disagreement_px, inside = measure_disagreement(disparity_px, right_disparity_px)
+    (disagreement_px, inside), (alike, unlike) = side_by_side(
+        [
+            partial(measure_disagreement, disparity_px, right_disparity_px),
+            partial(_compare_at_match, left, images, disparity_px),
+        ],
+        count,
+    )
     agreed = inside & (np.abs(disagreement_px) <= _SAME_PX)
     occluded = is_occluded(disagreement_px, inside)
-    alike, unlike = _compare_at_match(left, images, disparity_px)
     confidence = np.where(unlike & ~occluded, _UNLIKE * trust, trust)
     # A confidence of 0 marks pixels without content or texture.
     confirmed = agreed & (trust > 0) & alike
@@ -198,10 +207,10 @@ def find_matching_costs(pair: StereoPair, count: int) -> UInt8[np.ndarray, "h w 
     from stereoweave.matching import refine_kernels as kernels  # it loads LLVM
 
     nothing = np.zeros(pair.left.shape[:2], np.float32)
-    own, other = (_cues(image, nothing, nothing) for image in (pair.left, pair.right))
+    own, other = (_cues(image, nothing, 0, nothing) for image in (pair.left, pair.right))
     search, size = _lay_out(np.zeros(_tiles(nothing.shape), np.int32), nothing == 0, count)
     costs = np.empty(size, np.uint8)
-    kernels.match(own, _align(other, 0, count, -1), search, -1, count, 0, len(nothing), costs)
+    kernels.match(own, _align(other, 0, count, -1, 1), search, -1, count, 0, len(nothing), costs)
     return costs.reshape(*nothing.shape, count)
 
 
@@ -236,22 +245,23 @@ def _match_views(
     threads: int,
 ) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
     """Match both views, and return the disparities of least cost in each view."""
-    width = images[0].shape[1]
-    # Beyond the width nothing matches, and an outlier would take the time of all candidates up to it.
-    left_px, right_px = (
-        np.clip(view, -width, width) for view in (estimate.disparity_px, estimate.right_disparity_px)
-    )
+    left_px, right_px = estimate.disparity_px, estimate.right_disparity_px
     first_px, count = _candidates(left_px, right_px)
-    left = _cues(images[0], left_px - first_px, estimate.confidence)
-    right = _cues(images[1], right_px - first_px, _COARSE * right_trust)
+    left, right = side_by_side(
+        [
+            partial(_cues, images[0], left_px, first_px, estimate.confidence),
+            partial(_cues, images[1], right_px, first_px, _COARSE * right_trust),
+        ],
+        threads,
+    )
     left_view = _View(
-        left, _align(right, first_px, count, -1), find_searched(estimate.confidence, extent), -1
+        left, _align(right, first_px, count, -1, threads), find_searched(estimate.confidence, extent), -1
     )
     found_px = _match_view(left_view, first_px, count, threads)
     right_searched = find_matches_of_found(estimate.disparity_px, found_px, extent.reach_px)
     if extent.both_views:
         right_searched |= find_searched(right_trust, extent)
-    right_view = _View(right, _align(left, first_px, count, 1), right_searched, 1)
+    right_view = _View(right, _align(left, first_px, count, 1, threads), right_searched, 1)
     return found_px, _match_view(right_view, first_px, count, threads)
 
 
@@ -272,31 +282,39 @@ def _match_strip(strip: _View, first_px: int, count: int, threads: int) -> Float
     from stereoweave.matching import refine_kernels as kernels
 
     own, other, _, towards = strip
-    height, width = own.grey.shape
+    searched = strip.searched.view(np.uint8)
     search, size = _choose_candidates(strip, count)
     costs, sums = np.empty(size, np.uint8), np.empty(size, np.uint16)
     before = (own.grey.take([0, *range(own.grey.shape[axis] - 1)], axis) for axis in (1, 0))
     steps_along, steps_down = (penalise_large_steps(own.grey, grey) for grey in before)
-    found_px = first_px + own.prior / np.float32(kernels.SUBSTEPS)
+    found_px = np.empty(own.grey.shape, np.float32)
 
     def match(first: int, last: int) -> None:
+        found_px[first:last] = first_px + own.prior[first:last] / np.float32(kernels.SUBSTEPS)
         kernels.match(own, other, search, towards, count, first, last, costs)
         kernels.along_rows(costs, own, search, steps_along, count, first, last, sums)
 
     def pick(first: int, last: int) -> None:
         kernels.along_columns(costs, own, search, steps_down, count, first_px, first, last, sums, found_px)
 
-    in_bands(match, height, threads, threads)
-    in_bands(pick, width, threads, threads)
+    per_column, per_row = (cv2.reduce(searched, axis, cv2.REDUCE_SUM, dtype=cv2.CV_32S) for axis in (0, 1))
+    in_even_bands(match, per_row.ravel(), threads)
+    in_even_bands(pick, per_column.ravel(), threads)
     return found_px
 
 
 def _candidates(*both: Float[np.ndarray, "h w"]) -> tuple[int, int]:
-    """Return the first candidate in px and the number of candidates, given both views' disparities."""
-    least_px = math.floor(min(view.min() for view in both))
+    """Return the first candidate in px and the number of candidates, given both views' disparities.
+
+    Beyond the width nothing matches, and an outlier would take the time of all candidates up to it.
+    """
+    width = both[0].shape[1]
+    ends_px = min(view.min() for view in both), max(view.max() for view in both)
+    least_px, greatest_px = (min(max(end_px, -width), width) for end_px in ends_px)
+    least_px = math.floor(least_px)
     # Parallel cameras have no disparities below 0, and candidates below 0 would attract a plain sky.
     first_px = least_px - _MARGIN_PX if least_px < 0 else max(least_px - _MARGIN_PX, 0)
-    last_px = math.ceil(max(view.max() for view in both)) + _MARGIN_PX
+    last_px = math.ceil(greatest_px) + _MARGIN_PX
     count = last_px - first_px + 1
     return first_px, count + -count % _CANDIDATES_MULTIPLE
 
@@ -356,13 +374,15 @@ def _lay_out(
     """Place the candidates of the searched pixels one after the other; also return their total number."""
     from stereoweave.matching import refine_kernels as kernels
 
-    search = kernels.Search(np.empty(searched.shape, np.int64), firsts)
+    search = kernels.Search(np.empty(searched.shape, np.int32), firsts)
     total = np.empty(1, np.int64)
     kernels.lay_out(searched, count, search, total)
     return search, int(total[0])
 
 
-def _cues(image: UInt8[np.ndarray, "h w *c"], above_first_px: np.ndarray, trust: np.ndarray) -> "Cues":
+def _cues(
+    image: UInt8[np.ndarray, "h w *c"], disparity_px: np.ndarray, first_px: int, trust: np.ndarray
+) -> "Cues":
     """Return what the kernels read of a colour or grey image."""
     from stereoweave.matching import refine_kernels as kernels
 
@@ -371,6 +391,8 @@ def _cues(image: UInt8[np.ndarray, "h w *c"], above_first_px: np.ndarray, trust:
     kernels.census(grey, codes)
     levels = np.stack(cv2.split(image), 1)
     rows = levels.reshape(-1, grey.shape[1])
+    width = grey.shape[1]
+    above_first_px = np.clip(disparity_px, -width, width) - first_px  # as `_candidates` limits them
     return kernels.Cues(
         grey=grey,
         census=codes,
@@ -387,7 +409,7 @@ def _halfway(levels: UInt8[np.ndarray, "*size"], others: UInt8[np.ndarray, "*siz
     return (levels & others) + ((levels ^ others) >> 1)
 
 
-def _align(cues: "Cues", first_px: int, count: int, towards: int) -> "Cues":
+def _align(cues: "Cues", first_px: int, count: int, towards: int, threads: int) -> "Cues":
     """Place the other image's columns as the kernels read them, between copies of the border columns.
 
     Only what the kernels read of the other image is placed: `grey` stays as it is.
@@ -395,12 +417,14 @@ def _align(cues: "Cues", first_px: int, count: int, towards: int) -> "Cues":
     width = cues.grey.shape[1]
     columns = first_px + np.arange(width + count - 1)
     inside = slice(*np.searchsorted(columns, [0, width]))
-    placed = {
-        name: _place(cue if towards > 0 else _mirror(cue), columns, inside)
-        for name, cue in cues._asdict().items()
-        if name != "grey"
-    }
-    return cues._replace(**placed)
+
+    def align(name: str) -> np.ndarray:
+        cue = getattr(cues, name)
+        return _place(cue if towards > 0 else _mirror(cue), columns, inside)
+
+    names = [name for name in cues._fields if name != "grey"]
+    placed = side_by_side([partial(align, name) for name in names], threads)
+    return cues._replace(**dict(zip(names, placed, strict=True)))
 
 
 def _mirror(cue: np.ndarray) -> np.ndarray:
@@ -419,8 +443,13 @@ def _place(cue: np.ndarray, columns: np.ndarray, inside: slice) -> np.ndarray:
 
 
 def right_confidence(estimate: Estimate) -> Float32[np.ndarray, "h w"]:
-    """Return the confidence of the right view's disparities, taken from the left view at their matches."""
-    seen_px, inside = at_match(estimate.disparity_px, estimate.right_disparity_px, 1)
-    confidence, _ = at_match(np.asarray(estimate.confidence, np.float32), estimate.right_disparity_px, 1)
-    agreed = inside & (np.abs(seen_px - estimate.right_disparity_px) <= _SAME_PX)
-    return np.where(agreed, confidence, np.float32(_DOUBTED) * confidence)
+    """Return the confidence of the right view's disparities, taken from the left view at their matches.
+
+    It is a fifth where the two views' disparities differ by more than 1 px.
+    """
+    from stereoweave.matching import refine_kernels as kernels  # it loads LLVM
+
+    trust = np.empty(estimate.disparity_px.shape, np.float32)
+    maps = (estimate.right_disparity_px, estimate.disparity_px, estimate.confidence)
+    kernels.carry_trust(*(np.asarray(each, np.float32, order="C") for each in maps), trust)
+    return trust

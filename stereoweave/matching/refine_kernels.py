@@ -30,6 +30,8 @@ CERTAIN = 0.85
 """Above this confidence, replacing the network's disparities does more harm than good."""
 AGREED_PX = 1.0
 """Greatest difference at which the two views' disparities agree."""
+DOUBTED = np.float32(0.2)
+"""Factor on the confidence where they do not."""
 RELIABLE_RUN = 8
 SLACK_PX = 2
 LARGEST_MOVE_PX = 24
@@ -70,13 +72,31 @@ class Search(typing.NamedTuple):
     """The candidates that are searched: those of each pixel from its tile's first one on.
 
     Attributes:
-        places: int64 [H, W], start of each pixel's candidates in the volumes; -1 where the network's
+        places: int32 [H, W], start of each pixel's candidates in the volumes; -1 where the network's
             disparity is not searched.
         firsts: int32, first candidate of each tile.
     """
 
     places: np.ndarray
     firsts: np.ndarray
+
+
+@kernel
+@typing.no_type_check
+def carry_trust(right_px, disparity_px, confidence, trust):
+    """Write the right view's trust: the left view's confidence at the match, less where the views disagree.
+
+    Matches outside the left image get the confidence of its border column.
+    """
+    height, width = right_px.shape
+    last = np.float32(width - 1)
+    for y in range(height):
+        for x in range(width):
+            column = np.float32(x) + right_px[y, x]
+            nearest = np.int64(np.rint(min(max(column, np.float32(0)), last)))
+            inside = np.float32(-0.5) < column < last + np.float32(0.5)
+            agreed = inside and abs(disparity_px[y, nearest] - right_px[y, x]) <= AGREED_PX
+            trust[y, x] = confidence[y, nearest] * (np.float32(1) if agreed else DOUBTED)
 
 
 @kernel
@@ -415,11 +435,13 @@ def settle(found_px, other_px, trust, towards, disparity_px, agreed):
     for y in range(height):
         for x in range(width):
             found = found_px[y, x]
-            column = np.int64(np.rint(x + towards * found))
-            agreed[y, x] = 0 <= column < width and abs(other_px[y, column] - found) <= AGREED_PX
-            imprecise = abs(disparity_px[y, x] - found) > PRECISE_PX
-            if agreed[y, x] and imprecise and trust[y, x] < CERTAIN:
-                disparity_px[y, x] = found
+            column = np.int32(np.rint(x + towards * found))
+            inside = (column >= 0) & (column < width)
+            seen_px = other_px[y, min(max(column, 0), width - 1)]
+            agreed[y, x] = inside & (abs(seen_px - found) <= AGREED_PX)
+            own_px = disparity_px[y, x]
+            replaced = agreed[y, x] & (abs(own_px - found) > PRECISE_PX) & (trust[y, x] < CERTAIN)
+            disparity_px[y, x] = found if replaced else own_px
 
 
 @kernel

@@ -1,7 +1,7 @@
 import cv2
 import numpy as np
 import pytest
-from plain_refining import plain_census, plain_costs, plain_pick, plain_settled, plain_sums
+from plain_refining import plain_census, plain_costs, plain_pick, plain_right_trust, plain_settled, plain_sums
 
 from stereoweave.errors import StereoweaveError
 from stereoweave.matching import refine as refining
@@ -214,6 +214,26 @@ def test_confidence_rises_to_0_7_where_both_views_agree_on_texture(rng):
     np.testing.assert_array_equal(refined.confidence[:, 130:140], np.float32(0))  # without content
 
 
+def test_confidence_stays_where_the_pictures_differ_and_falls_where_they_hardly_match():
+    columns, rows = np.arange(240), np.arange(48)[:, None]
+    left = np.where(columns // 3 % 2, 140, 100) + 0 * rows
+    sign = np.where((columns + columns // 4 + rows + rows // 4) % 2, 1, -1)
+    right = left.copy()
+    # Means of three columns are 100, 113, 127 and 140; their span over five, the contrast, is 27 or 40.
+    right[:, 80:96] += 20 * sign[:, 80:96]  # 17 levels after equalisation: above 40 % of 40, below 80 % of 27
+    right[:, 160:176] += 40 * sign[:, 160:176]  # 35 levels: above 80 % of 40
+    images = (np.repeat(image[..., None], 3, 2).astype(np.uint8) for image in (left, right))
+    refined = refine_doubtful(*images, estimate_of(*np.zeros((2, 48, 240)), confidence=0.6))
+    for first, end, confidence in (
+        (0, 75, 0.7),
+        (84, 92, 0.6),
+        (100, 155, 0.7),
+        (164, 172, 0.42),
+        (180, 240, 0.7),
+    ):
+        np.testing.assert_allclose(refined.confidence[:, first:end], confidence, atol=1e-6)
+
+
 def random_pair(rng):
     """Return random images and a random estimate, which exercise every branch; a block in it is certain."""
     left, right = (cv2.blur(rng.integers(0, 256, (24, 50, 3), np.uint8), (3, 3)) for _ in range(2))
@@ -229,9 +249,9 @@ def test_the_kernels_equal_the_plain_ones(rng, in_colour):
     if not in_colour:
         left, right = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (left, right))
     first_px, count = refining._candidates(given.disparity_px, given.right_disparity_px)
-    own = refining._cues(left, given.disparity_px - first_px, given.confidence)
+    own = refining._cues(left, given.disparity_px, first_px, given.confidence)
     right_trust = refining.right_confidence(given)
-    other = refining._cues(right, given.right_disparity_px - first_px, np.float32(0.7) * right_trust)
+    other = refining._cues(right, given.right_disparity_px, first_px, np.float32(0.7) * right_trust)
     for view in (own, other):
         np.testing.assert_array_equal(view.census, plain_census(view.grey))
     searched = np.ones((24, 50), bool)
@@ -239,7 +259,7 @@ def test_the_kernels_equal_the_plain_ones(rng, in_colour):
     np.testing.assert_array_equal(refining.find_searched(given.confidence, refining.WIDE), searched)
     search, size = refining._lay_out(np.zeros((1, 2), np.int32), searched, count)
     costs = np.empty(size, np.uint8)
-    kernels.match(own, refining._align(other, first_px, count, -1), search, -1, count, 0, 24, costs)
+    kernels.match(own, refining._align(other, first_px, count, -1, 2), search, -1, count, 0, 24, costs)
     expected = plain_costs(own, other, first_px, count)
     np.testing.assert_array_equal(costs, expected[searched].ravel())
     found_px, _ = refining._match_views((left, right), given, refining.WIDE, right_trust, 1)
@@ -258,8 +278,8 @@ def test_each_tile_searches_from_the_least_disparity_of_the_tiles_around(rng, mo
     given.confidence[:, 120:140] = 0.9
     first_px, count = refining._candidates(given.disparity_px, given.right_disparity_px)
     right_trust = refining.right_confidence(given)
-    own = refining._cues(left, given.disparity_px - first_px, given.confidence)
-    other = refining._cues(right, given.right_disparity_px - first_px, np.float32(0.7) * right_trust)
+    own = refining._cues(left, given.disparity_px, first_px, given.confidence)
+    other = refining._cues(right, given.right_disparity_px, first_px, np.float32(0.7) * right_trust)
     searched = refining.find_searched(given.confidence, refining.WIDE)
     costs = plain_costs(own, other, first_px, count)
     expected_px = plain_pick(plain_sums(costs, own, searched), first_px)
@@ -279,6 +299,20 @@ def test_both_views_settle_as_the_plain_ones(rng):
     expected = plain_settled(given.right_disparity_px, *found_px[::-1], np.float32(0.7) * right_trust, 1)
     np.testing.assert_array_equal(refined.right_disparity_px, expected)
     assert (refined.disparity_px != given.disparity_px).any()
+
+
+def test_the_right_view_gets_the_confidence_that_the_plain_reference_gives_it(rng):
+    _, _, given = random_pair(rng)
+    maps = given.right_disparity_px, given.disparity_px, given.confidence
+    np.testing.assert_array_equal(refining.right_confidence(given), plain_right_trust(*maps))
+
+
+def test_the_right_view_has_a_fifth_of_the_confidence_where_its_match_is_of_another_surface():
+    given = estimate_of(np.array([[4, 4, 4, 2, 3]]), np.array([[2, 2, 0, 9, -9]]))
+    given.confidence[0] = 0.1, 0.2, 0.3, 0.4, 0.5
+    # The matches are in columns 2 (2 px off), 3 (alike), 2 (4 px off) and outside, beyond both borders.
+    expected = np.float32([0.06, 0.4, 0.06, 0.1, 0.02])
+    np.testing.assert_allclose(refining.right_confidence(given), expected[None])
 
 
 def test_a_right_view_is_matched_as_the_left_one_of_the_mirrored_pair(scene, monkeypatch):
