@@ -138,8 +138,9 @@ Screen = Annotated[
 Model = Annotated[
     str,
     typer.Option(
-        help="Shipped network (small or base), or an .onnx matcher file. base is always refined. For "
-        "stills, also best, which runs it a second time at 1.5 times the size and settles edges by vote."
+        help="Shipped network (small or base), or an .onnx matcher file. small is matched once more where it "
+        "is unsure, base wherever it is not certain. For stills, also best, which runs base a second time at "
+        "1.5 times the size and settles edges by vote."
     ),
 ]
 Threads = Annotated[int | None, typer.Option(min=1, help="Number of CPU threads (default: all cores).")]
