@@ -31,7 +31,7 @@ from stereoweave.matching.network import Network
 from stereoweave.matching.occlusion_fill import fill_occluded
 from stereoweave.matching.options import MatchOptions
 from stereoweave.matching.providers import CPU, PROVIDERS
-from stereoweave.matching.refine import refine, refine_doubtful
+from stereoweave.matching.refine import NARROW, WIDE, refine
 from stereoweave.matching.streaks import smooth_streaks
 from stereoweave.matching.subpixel import to_subpixel
 from stereoweave.stereo import LONGEST_SIDE_PX, Estimate, StereoPair
@@ -140,7 +140,7 @@ class Matcher:
     ) -> Estimate:
         """Estimate both views' disparities, the confidence and the occlusion mask of a rectified pair.
 
-        Where a named network is unsure, the pair is matched once more (`refine.refine_doubtful`). The left
+        Where a named network is unsure, the pair is matched once more (`refine.NARROW`). The left
         view's disparity is refined to a fraction of a pixel (`subpixel.to_subpixel`). Occluded pixels are
         filled with the disparity of the background (`occlusion_fill.fill_occluded`).
 
@@ -193,8 +193,8 @@ class Matcher:
         """
         refined = refined or self.refines
         if refined or self.searches:
-            search = refine if refined else refine_doubtful
-            found = apply_masks(search(pair.left, pair.right, found, self.threads), pair)
+            extent = WIDE if refined else NARROW
+            found = apply_masks(refine(pair.left, pair.right, found, self.threads, extent), pair)
         found = to_subpixel(pair.left, pair.right, found, self.threads)
         found = smooth_streaks(fill_occluded(found, pair.left_seen))
         if self.votes:

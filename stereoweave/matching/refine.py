@@ -107,6 +107,7 @@ def refine(
     right: UInt8[np.ndarray, "h w 3"],
     estimate: Estimate,
     threads: int | None = None,
+    extent: Extent = WIDE,
 ) -> Estimate:
     """Correct the disparities of both views by semi-global matching at full resolution.
 
@@ -120,31 +121,8 @@ def refine(
         right: Right image of the same size.
         estimate: The pair's estimate (`stereoweave.estimate`).
         threads: Maximum number of threads; default: all cores. At most four are used.
+        extent: What is searched. NARROW takes about half of WIDE's time.
     """
-    return _refine(left, right, estimate, WIDE, threads)
-
-
-@step("refining")
-def refine_doubtful(
-    left: UInt8[np.ndarray, "h w 3"],
-    right: UInt8[np.ndarray, "h w 3"],
-    estimate: Estimate,
-    threads: int | None = None,
-) -> Estimate:
-    """Refine as `refine` does, but search only around pixels of a confidence below 0.45, and by grey levels.
-
-    This takes about half of the time.
-    """
-    return _refine(left, right, estimate, NARROW, threads)
-
-
-def _refine(
-    left: UInt8[np.ndarray, "h w 3"],
-    right: UInt8[np.ndarray, "h w 3"],
-    estimate: Estimate,
-    extent: Extent,
-    threads: int | None,
-) -> Estimate:
     pair = StereoPair(left=left, right=right)
     check_fits(estimate, pair)
     images = (left, equalise_right(pair, estimate)) if extent.in_colour else equalise_grey(pair, estimate)

@@ -7,7 +7,7 @@ from stereoweave.errors import StereoweaveError
 from stereoweave.matching import refine as refining
 from stereoweave.matching import refine_kernels as kernels
 from stereoweave.matching.matcher import Matcher
-from stereoweave.matching.refine import refine, refine_doubtful
+from stereoweave.matching.refine import NARROW, refine
 from stereoweave.stereo import Estimate, StereoPair
 
 FAR_PX, NEAR_PX, STICK_PX = 6, 16, 12
@@ -108,7 +108,7 @@ def test_the_right_view_is_searched_around_the_matches_of_newly_found_left_dispa
 def test_only_doubtful_disparities_are_replaced_without_a_wide_search(scene, confidence, share_found):
     left, right, left_px, right_px = scene
     given = estimate_of(*without_stick(left_px, right_px), confidence=confidence)
-    found_px = refine_doubtful(left, right, given).disparity_px
+    found_px = refine(left, right, given, extent=NARROW).disparity_px
     in_left = slice(STICK.start + STICK_PX, STICK.stop + STICK_PX)
     assert (abs(found_px[:, in_left] - STICK_PX) < 1).mean() >= share_found
     if not share_found:
@@ -131,7 +131,7 @@ def test_an_outlier_far_beyond_the_picture_does_not_widen_the_search_to_it(scene
     left, right, left_px, right_px = scene
     given = estimate_of(np.where(np.isnan(left_px), FAR_PX, left_px), right_px)
     given.disparity_px[0, 0] = 1e6
-    found = refine_doubtful(left, right, given)
+    found = refine(left, right, given, extent=NARROW)
     assert (abs(found.disparity_px - given.disparity_px)[2:, 20:] < 1).mean() > 0.99
 
 
@@ -223,7 +223,7 @@ def test_confidence_stays_where_the_pictures_differ_and_falls_where_they_hardly_
     right[:, 80:96] += 20 * sign[:, 80:96]  # 17 levels after equalisation: above 40 % of 40, below 80 % of 27
     right[:, 160:176] += 40 * sign[:, 160:176]  # 35 levels: above 80 % of 40
     images = (np.repeat(image[..., None], 3, 2).astype(np.uint8) for image in (left, right))
-    refined = refine_doubtful(*images, estimate_of(*np.zeros((2, 48, 240)), confidence=0.6))
+    refined = refine(*images, estimate_of(*np.zeros((2, 48, 240)), confidence=0.6), extent=NARROW)
     for first, end, confidence in (
         (0, 75, 0.7),
         (84, 92, 0.6),
