@@ -24,6 +24,7 @@ EXPERIMENTS = (
     "paper_sets",
     "paper_transfer",
     "paper_worlds",
+    "search_extents",
     "speed",
     "sphere_windows",
     "stage_costs",

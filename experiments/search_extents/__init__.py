@@ -1,0 +1,1 @@
+"""Errors of a network whose estimates are matched once more to several extents."""
