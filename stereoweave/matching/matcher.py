@@ -140,7 +140,7 @@ class Matcher:
     ) -> Estimate:
         """Estimate both views' disparities, the confidence and the occlusion mask of a rectified pair.
 
-        Where a named network is unsure, the pair is matched once more (`refine.NARROW`). The left
+        Where a named network is unsure, the pair is matched once more (`refine.refine`). The left
         view's disparity is refined to a fraction of a pixel (`subpixel.to_subpixel`). Occluded pixels are
         filled with the disparity of the background (`occlusion_fill.fill_occluded`).
 

@@ -22,7 +22,7 @@ from stereoweave.matching.left_right_check import is_occluded, measure_disagreem
 from stereoweave.matching.step_penalties import penalise_large_steps
 from stereoweave.stereo import Estimate, StereoPair, check_fits
 from stereoweave.system.steps import step
-from stereoweave.system.threads import in_even_bands, side_by_side, thread_count
+from stereoweave.system.threads import in_even_bands, run_together, thread_count
 
 if TYPE_CHECKING:
     from stereoweave.matching.refine_kernels import Cues, Search
@@ -121,7 +121,8 @@ def refine(
         right: Right image of the same size.
         estimate: The pair's estimate (`stereoweave.estimate`).
         threads: Maximum number of threads; default: all cores. At most four are used.
-        extent: What is searched. NARROW takes about half of WIDE's time.
+        extent: What is searched: by default all that is not certain, in colour; by NARROW, what is around
+            pixels of a confidence below 0.45, by grey levels, in half of the time.
     """
     pair = StereoPair(left=left, right=right)
     check_fits(estimate, pair)
@@ -131,14 +132,14 @@ def refine(
     right_trust = right_confidence(estimate)
     found_px, right_found_px = _match_views(images, estimate, extent, right_trust, count)
     right_px = estimate.right_disparity_px
-    disparity_px, right_disparity_px = side_by_side(
+    disparity_px, right_disparity_px = run_together(
         [
             partial(_settle, estimate.disparity_px, found_px, right_found_px, trust, -1),
             partial(_settle, right_px, right_found_px, found_px, _COARSE * right_trust, 1),
         ],
         count,
     )
-    (disagreement_px, inside), (alike, unlike) = side_by_side(
+    (disagreement_px, inside), (alike, unlike) = run_together(
         [
             partial(measure_disagreement, disparity_px, right_disparity_px),
             partial(_compare_at_match, left, images, disparity_px),
@@ -225,7 +226,7 @@ def _match_views(
     """Match both views, and return the disparities of least cost in each view."""
     left_px, right_px = estimate.disparity_px, estimate.right_disparity_px
     first_px, count = _candidates(left_px, right_px)
-    left, right = side_by_side(
+    left, right = run_together(
         [
             partial(_cues, images[0], left_px, first_px, estimate.confidence),
             partial(_cues, images[1], right_px, first_px, _COARSE * right_trust),
@@ -352,7 +353,7 @@ def _lay_out(
     """Place the candidates of the searched pixels one after the other; also return their total number."""
     from stereoweave.matching import refine_kernels as kernels
 
-    search = kernels.Search(np.empty(searched.shape, np.int32), firsts)
+    search = kernels.Search(np.empty(searched.shape, np.int64), firsts)
     total = np.empty(1, np.int64)
     kernels.lay_out(searched, count, search, total)
     return search, int(total[0])
@@ -401,7 +402,7 @@ def _align(cues: "Cues", first_px: int, count: int, towards: int, threads: int) 
         return _place(cue if towards > 0 else _mirror(cue), columns, inside)
 
     names = [name for name in cues._fields if name != "grey"]
-    placed = side_by_side([partial(align, name) for name in names], threads)
+    placed = run_together([partial(align, name) for name in names], threads)
     return cues._replace(**dict(zip(names, placed, strict=True)))
 
 

@@ -30,8 +30,8 @@ CERTAIN = 0.85
 """Above this confidence, replacing the network's disparities does more harm than good."""
 AGREED_PX = 1.0
 """Greatest difference at which the two views' disparities agree."""
-DOUBTED = np.float32(0.2)
-"""Factor on the confidence where they do not."""
+DISAGREED = np.float32(0.2)
+"""Factor on the confidence of a right pixel where the views' disparities do not agree."""
 RELIABLE_RUN = 8
 SLACK_PX = 2
 LARGEST_MOVE_PX = 24
@@ -72,7 +72,7 @@ class Search(typing.NamedTuple):
     """The candidates that are searched: those of each pixel from its tile's first one on.
 
     Attributes:
-        places: int32 [H, W], start of each pixel's candidates in the volumes; -1 where the network's
+        places: int64 [H, W], start of each pixel's candidates in the volumes; -1 where the network's
             disparity is not searched.
         firsts: int32, first candidate of each tile.
     """
@@ -96,7 +96,7 @@ def carry_trust(right_px, disparity_px, confidence, trust):
             nearest = np.int64(np.rint(min(max(column, np.float32(0)), last)))
             inside = np.float32(-0.5) < column < last + np.float32(0.5)
             agreed = inside and abs(disparity_px[y, nearest] - right_px[y, x]) <= AGREED_PX
-            trust[y, x] = confidence[y, nearest] * (np.float32(1) if agreed else DOUBTED)
+            trust[y, x] = confidence[y, nearest] * (np.float32(1) if agreed else DISAGREED)
 
 
 @kernel
@@ -436,6 +436,7 @@ def settle(found_px, other_px, trust, towards, disparity_px, agreed):
         for x in range(width):
             found = found_px[y, x]
             column = np.int32(np.rint(x + towards * found))
+            # No branches, so that the loop can be vectorised.
             inside = (column >= 0) & (column < width)
             seen_px = other_px[y, min(max(column, 0), width - 1)]
             agreed[y, x] = inside & (abs(seen_px - found) <= AGREED_PX)

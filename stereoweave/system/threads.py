@@ -1,4 +1,4 @@
-"""The number of threads to use, and parallel work, on bands of image rows or of other kinds."""
+"""The number of threads to use, and work in parallel: on bands of rows, or by several functions."""
 
 import os
 from collections import deque
@@ -100,15 +100,15 @@ def _work_through(work: Callable[[int, int], None], ends: Sequence[int], threads
         other.result()
 
 
-def side_by_side(works: Sequence[Callable[[], Result]], threads: int) -> list[Result]:
+def run_together(functions: Sequence[Callable[[], Result]], threads: int) -> list[Result]:
     """Return what each function returns; up to `threads` of them run at once."""
-    results: list[Any] = [None] * len(works)
+    results: list[Any] = [None] * len(functions)
 
     def run(first: int, end: int) -> None:
         for index in range(first, end):
-            results[index] = works[index]()
+            results[index] = functions[index]()
 
-    in_bands(run, len(works), len(works), threads)
+    in_bands(run, len(functions), len(functions), threads)
     return results
 
 

@@ -89,7 +89,7 @@ def _add_path(costs, grey, searched, known, closed, total):
 
 
 def plain_right_trust(right_px, disparity_px, confidence):
-    """Return the right view's confidence: that at the match, or a fifth where the views disagree by 1 px."""
+    """Return the right view's confidence: that at the match, or a fifth of it where they disagree."""
     width = right_px.shape[1]
     columns = np.arange(width) + right_px
     match = np.rint(np.clip(columns, 0, width - 1)).astype(int)

@@ -234,18 +234,18 @@ def test_confidence_stays_where_the_pictures_differ_and_falls_where_they_hardly_
         np.testing.assert_allclose(refined.confidence[:, first:end], confidence, atol=1e-6)
 
 
-def random_pair(rng):
+def random_pair(rng, width=50):
     """Return random images and a random estimate, which exercise every branch; a block in it is certain."""
-    left, right = (cv2.blur(rng.integers(0, 256, (24, 50, 3), np.uint8), (3, 3)) for _ in range(2))
-    maps = [np.repeat(rng.uniform(-3, 9, (24, 10)), 5, 1) for _ in range(2)]
-    given, confidence = estimate_of(*maps), rng.random((24, 50), np.float32)
+    left, right = (cv2.blur(rng.integers(0, 256, (24, width, 3), np.uint8), (3, 3)) for _ in range(2))
+    maps = [np.repeat(rng.uniform(-3, 9, (24, 10)), 5, 1)[:, :width] for _ in range(2)]
+    given, confidence = estimate_of(*maps), rng.random((24, width), np.float32)
     confidence[CERTAIN] = 0.9
     return left, right, Estimate(**vars(given) | {"confidence": confidence})
 
 
-@pytest.mark.parametrize("in_colour", [True, False])
-def test_the_kernels_equal_the_plain_ones(rng, in_colour):
-    left, right, given = random_pair(rng)
+@pytest.mark.parametrize(("width", "in_colour"), [(50, True), (50, False), (49, True)])
+def test_the_kernels_equal_the_plain_ones(rng, width, in_colour):
+    left, right, given = random_pair(rng, width)
     if not in_colour:
         left, right = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (left, right))
     first_px, count = refining._candidates(given.disparity_px, given.right_disparity_px)
@@ -254,7 +254,7 @@ def test_the_kernels_equal_the_plain_ones(rng, in_colour):
     other = refining._cues(right, given.right_disparity_px, first_px, np.float32(0.7) * right_trust)
     for view in (own, other):
         np.testing.assert_array_equal(view.census, plain_census(view.grey))
-    searched = np.ones((24, 50), bool)
+    searched = np.ones((24, width), bool)
     searched[8:16, 14:36] = False  # 4 px and more inside the block
     np.testing.assert_array_equal(refining.find_searched(given.confidence, refining.WIDE), searched)
     search, size = refining._lay_out(np.zeros((1, 2), np.int32), searched, count)

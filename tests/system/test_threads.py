@@ -11,7 +11,7 @@ from stereoweave.system.threads import (
     beyond_ctrl_c,
     in_bands,
     in_even_bands,
-    side_by_side,
+    run_together,
     thread_count,
     usable_cores,
 )
@@ -63,11 +63,11 @@ def test_even_bands_cover_all_rows_and_have_about_the_same_work(amounts, threads
     assert sorted(seen) == bands
 
 
-def test_functions_that_wait_for_each_other_run_side_by_side_and_return_in_order():
+def test_functions_that_wait_for_each_other_run_together_and_return_in_order():
     together = threading.Barrier(3)
     works = [lambda number=number: (together.wait(timeout=20), number)[1] for number in range(3)]
-    assert side_by_side(works, 3) == [0, 1, 2]
-    assert side_by_side([lambda: "alone"], 1) == ["alone"]
+    assert run_together(works, 3) == [0, 1, 2]
+    assert run_together([lambda: "alone"], 1) == ["alone"]
 
 
 def meet():
