@@ -92,7 +92,7 @@ def _score(scene: Scene, raw: Estimate, extent: Extent) -> tuple[float, ...]:
     found = raw if extent == NOWHERE else refine(left, right, raw, extent=extent)
     found_px = smooth_streaks(fill_occluded(to_subpixel(left, right, found))).disparity_px
     bad1, bad2 = (bad_percent(found_px, scene.truth_px, limit_px) for limit_px in (1, 2))
-    searched_percent = 100 * float(find_searched(raw.confidence, extent).mean())
+    searched_percent = 100 * float(find_searched(raw.disparity_px, raw.confidence, -1, extent).mean())
     return (
         searched_percent,
         epe_px(found_px, scene.truth_px),

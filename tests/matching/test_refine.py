@@ -140,7 +140,22 @@ def test_pixels_up_to_2_px_from_doubtful_ones_are_searched():
     confidence[4, 6] = 0.44
     expected = np.zeros((9, 12), bool)
     expected[2:7, 4:9] = True
-    np.testing.assert_array_equal(refining.find_searched(confidence, refining.NARROW), expected)
+    found = refining.find_searched(np.zeros((9, 12)), confidence, -1, NARROW)
+    np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize("towards", [-1, 1])
+def test_pixels_whose_match_is_more_than_2_px_outside_the_other_picture_are_not_searched(towards):
+    confidence = np.zeros((9, 30), np.float32)
+    found = refining.find_searched(np.full((9, 30), 10, np.float32), confidence, towards, NARROW)
+    # Of the left view, those up to column 7; but pixels up to 2 px from a searched one are searched too.
+    np.testing.assert_array_equal(found[:, ::-towards], np.tile(np.arange(30) >= 6, (9, 1)))
+
+
+def test_a_disparity_below_zero_may_lead_outside_the_other_side():
+    confidence = np.zeros((5, 30), np.float32)
+    found = refining.find_searched(np.full((5, 30), -10, np.float32), confidence, -1, NARROW)
+    np.testing.assert_array_equal(found, np.tile(np.arange(30) <= 23, (5, 1)))
 
 
 def test_correct_disparities_do_not_change_by_a_bit(scene):
@@ -256,7 +271,9 @@ def test_the_kernels_equal_the_plain_ones(rng, width, in_colour):
         np.testing.assert_array_equal(view.census, plain_census(view.grey))
     searched = np.ones((24, width), bool)
     searched[8:16, 14:36] = False  # 4 px and more inside the block
-    np.testing.assert_array_equal(refining.find_searched(given.confidence, refining.WIDE), searched)
+    np.testing.assert_array_equal(
+        refining.find_searched(given.disparity_px, given.confidence, -1, refining.WIDE), searched
+    )
     search, size = refining._lay_out(np.zeros((1, 2), np.int32), searched, count)
     costs = np.empty(size, np.uint8)
     kernels.match(own, refining._align(other, first_px, count, -1, 2), search, -1, count, 0, 24, costs)
@@ -280,7 +297,7 @@ def test_each_tile_searches_from_the_least_disparity_of_the_tiles_around(rng, mo
     right_trust = refining.right_confidence(given)
     own = refining._cues(left, given.disparity_px, first_px, given.confidence)
     other = refining._cues(right, given.right_disparity_px, first_px, np.float32(0.7) * right_trust)
-    searched = refining.find_searched(given.confidence, refining.WIDE)
+    searched = refining.find_searched(given.disparity_px, given.confidence, -1, refining.WIDE)
     costs = plain_costs(own, other, first_px, count)
     expected_px = plain_pick(plain_sums(costs, own, searched), first_px)
     found_px, _ = refining._match_views((left, right), given, refining.WIDE, right_trust, 2)
