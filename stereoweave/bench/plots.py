@@ -28,6 +28,10 @@ _PLACES: tuple[_Place, ...] = (
     ((0, -6), "center", "top"),
     ((7, 0), "left", "center"),
     ((-7, 0), "right", "center"),
+    ((-5, -5), "right", "top"),
+    ((5, -5), "left", "top"),
+    ((5, 5), "left", "bottom"),
+    ((-5, 5), "right", "bottom"),
 )
 
 

@@ -65,6 +65,18 @@ def test_names_of_nearly_coincident_points_do_not_overlap(tmp_path, drawn):
         assert not any(one.overlaps(other) for one, other in itertools.combinations(boxes, 2))
 
 
+def test_a_name_covers_no_point_of_another_matcher(tmp_path, drawn):
+    opencv = [("bm", 20, 20.8, 2.25), ("sgbm", 150, 16.9, 2.33)]
+    base, best = ("base", 245, 9.3, 0.69), ("best", 784, 7.8, 0.65)
+    small = [("small", 114, 13.5, 0.88), ("small refined", 156, 12.3, 0.80)]
+    rows = [row(*each) for each in (*opencv, base, *small, best)]
+    draw_error_over_time(tmp_path / "time.png", rows)
+    for axes in drawn[0].axes:
+        points = [axes.transData.transform(line.get_xydata()[0]) for line in axes.lines]
+        for label in axes.texts:
+            assert not any(label.get_window_extent().contains(*point) for point in points)
+
+
 def test_each_confidence_has_its_curve_and_its_oracle_in_one_colour(tmp_path, drawn, rng):
     curve = sparsification(rng.uniform(0, 3, 50), rng.uniform(0, 1, 50))
     curves = {"small": Curves(curve, curve), "mc_cnn raw": Curves(curve, curve)}
