@@ -59,7 +59,8 @@ class ExtentRow:
 def score_extents(folder: Path, model: str, every: int = 1) -> list[ExtentRow]:
     """Return a row for each of EXTENTS, over one of `every` pairs of a folder.
 
-    After the search, estimates are finished as `Matcher.finish` does; no edges are settled by vote.
+    The pairs need no content masks. After the search, estimates are finished as by `Matcher.finish`, but no
+    edges are settled by vote. A pair that the network sees at another size is searched at its own size.
     """
     estimated = list(_estimate_scenes(folder, Matcher(model), every))
     return [_average(folder.name, estimated, extent) for extent in EXTENTS]

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Float32, Int32, UInt8
 
 from stereoweave.matching.contrast import measure_contrast
 from stereoweave.matching.exposure import equalise_grey, equalise_right
-from stereoweave.matching.left_right_check import is_occluded, measure_disagreement
+from stereoweave.matching.left_right_check import at_match, is_occluded, measure_disagreement
 from stereoweave.matching.step_penalties import penalise_large_steps
 from stereoweave.stereo import Estimate, StereoPair, check_fits
 from stereoweave.system.steps import step
@@ -41,6 +41,8 @@ _OUTSIDE_PX = 2
 # A tile's first candidate is the least disparity in it and in the eight tiles around it. Nearer surfaces are
 # searched everywhere, because what the network misses is nearer than what is around it.
 _TILES_AROUND = np.ones((3, 3), np.uint8)
+# Factor on a pixel's confidence where the network's disparities for the two views disagree.
+_DOUBTED = 0.2
 _SAME_PX = 1.0
 # Factor on the confidence of the right view's disparities, because those of the shipped networks lack the
 # last refinement (decision 0035). None then reaches CERTAIN, so any of them that is searched may be replaced.
@@ -128,10 +130,11 @@ def refine(
     """
     pair = StereoPair(left=left, right=right)
     check_fits(estimate, pair)
-    images = (left, equalise_right(pair, estimate)) if extent.in_colour else equalise_grey(pair, estimate)
     count = min(_MOST_THREADS, thread_count(threads))
     trust = np.asarray(estimate.confidence, np.float32, order="C")
-    right_trust = right_confidence(estimate)
+    images, right_trust = run_together(
+        [partial(_equalise, pair, estimate, extent), partial(right_confidence, estimate)], count
+    )
     found_px, right_found_px = _match_views(images, estimate, extent, right_trust, count)
     right_px = estimate.right_disparity_px
     disparity_px, right_disparity_px = run_together(
@@ -159,6 +162,13 @@ def refine(
         confidence=np.where(confirmed, np.maximum(confidence, _CONFIRMED), confidence),
         occluded=occluded,
     )
+
+
+def _equalise(
+    pair: StereoPair, estimate: Estimate, extent: Extent
+) -> tuple[UInt8[np.ndarray, "h w *c"], UInt8[np.ndarray, "h w *c"]]:
+    """Return both images to compare, the right one with the left one's exposure."""
+    return (pair.left, equalise_right(pair, estimate)) if extent.in_colour else equalise_grey(pair, estimate)
 
 
 def _compare_at_match(
@@ -278,8 +288,8 @@ def _match_strip(strip: _View, first_px: int, count: int, threads: int) -> Float
         kernels.along_columns(costs, own, search, steps_down, count, first_px, first, last, sums, found_px)
 
     per_column, per_row = (cv2.reduce(searched, axis, cv2.REDUCE_SUM, dtype=cv2.CV_32S) for axis in (0, 1))
-    in_even_bands(match, per_row.ravel(), threads)
-    in_even_bands(pick, per_column.ravel(), threads)
+    in_even_bands(match, per_row.ravel().tolist(), threads)
+    in_even_bands(pick, per_column.ravel().tolist(), threads)
     return found_px
 
 
@@ -435,13 +445,8 @@ def _place(cue: np.ndarray, columns: np.ndarray, inside: slice) -> np.ndarray:
 
 
 def right_confidence(estimate: Estimate) -> Float32[np.ndarray, "h w"]:
-    """Return the confidence of the right view's disparities, taken from the left view at their matches.
-
-    It is a fifth where the two views' disparities differ by more than 1 px.
-    """
-    from stereoweave.matching import refine_kernels as kernels  # it loads LLVM
-
-    trust = np.empty(estimate.disparity_px.shape, np.float32)
-    maps = (estimate.right_disparity_px, estimate.disparity_px, estimate.confidence)
-    kernels.carry_trust(*(np.asarray(each, np.float32, order="C") for each in maps), trust)
-    return trust
+    """Return the confidence of the right view's disparities, taken from the left view at their matches."""
+    seen_px, inside = at_match(estimate.disparity_px, estimate.right_disparity_px, 1)
+    confidence, _ = at_match(np.asarray(estimate.confidence, np.float32), estimate.right_disparity_px, 1)
+    agreed = inside & (np.abs(seen_px - estimate.right_disparity_px) <= _SAME_PX)
+    return np.where(agreed, confidence, np.float32(_DOUBTED) * confidence)

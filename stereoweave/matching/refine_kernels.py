@@ -30,8 +30,6 @@ CERTAIN = 0.85
 """Above this confidence, replacing the network's disparities does more harm than good."""
 AGREED_PX = 1.0
 """Greatest difference at which the two views' disparities agree."""
-DISAGREED = np.float32(0.2)
-"""Factor on the confidence of a right pixel where the views' disparities do not agree."""
 RELIABLE_RUN = 8
 SLACK_PX = 2
 LARGEST_MOVE_PX = 24
@@ -79,24 +77,6 @@ class Search(typing.NamedTuple):
 
     places: np.ndarray
     firsts: np.ndarray
-
-
-@kernel
-@typing.no_type_check
-def carry_trust(right_px, disparity_px, confidence, trust):
-    """Write the right view's trust: the left view's confidence at the match, less where the views disagree.
-
-    Matches outside the left image get the confidence of its border column.
-    """
-    height, width = right_px.shape
-    last = np.float32(width - 1)
-    for y in range(height):
-        for x in range(width):
-            column = np.float32(x) + right_px[y, x]
-            nearest = np.int64(np.rint(min(max(column, np.float32(0)), last)))
-            inside = np.float32(-0.5) < column < last + np.float32(0.5)
-            agreed = inside and abs(disparity_px[y, nearest] - right_px[y, x]) <= AGREED_PX
-            trust[y, x] = confidence[y, nearest] * (np.float32(1) if agreed else DISAGREED)
 
 
 @kernel

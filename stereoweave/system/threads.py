@@ -1,15 +1,13 @@
 """The number of threads to use, and work in parallel: on bands of rows, or by several functions."""
 
 import os
+from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextvars import copy_context
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from typing import Any, TypeVar
-
-import numpy as np
-from jaxtyping import Int
 
 from stereoweave.arguments import check_whole_number
 from stereoweave.errors import StereoweaveError
@@ -61,7 +59,7 @@ def in_bands(work: Callable[[int, int], None], height: int, count: int, threads:
     _work_through(work, [height * band // count for band in range(count + 1)], threads)
 
 
-def in_even_bands(work: Callable[[int, int], None], amounts: Int[np.ndarray, " n"], threads: int) -> None:
+def in_even_bands(work: Callable[[int, int], None], amounts: Sequence[float], threads: int) -> None:
     """Call `work` for one band per thread, as `in_bands` does; all bands have about the same work.
 
     Args:
@@ -69,9 +67,10 @@ def in_even_bands(work: Callable[[int, int], None], amounts: Int[np.ndarray, " n
         amounts: The amount of work in each row.
         threads: Number of threads.
     """
-    done = np.cumsum(amounts)
     # A row belongs to the band in which the middle of its work lies.
-    inner = np.searchsorted(done - amounts / 2, done[-1] * np.arange(1, threads) / threads).tolist()
+    middles = [done - amount / 2 for done, amount in zip(accumulate(amounts), amounts, strict=True)]
+    total = sum(amounts)
+    inner = [bisect_left(middles, total * band / threads) for band in range(1, threads)]
     _work_through(work, [0, *inner, len(amounts)], threads)
 
 

@@ -88,16 +88,6 @@ def _add_path(costs, grey, searched, known, closed, total):
         total[y] += path
 
 
-def plain_right_trust(right_px, disparity_px, confidence):
-    """Return the right view's confidence: that at the match, or a fifth of it where they disagree."""
-    width = right_px.shape[1]
-    columns = np.arange(width) + right_px
-    match = np.rint(np.clip(columns, 0, width - 1)).astype(int)
-    there_px, there = (np.take_along_axis(values, match, axis=1) for values in (disparity_px, confidence))
-    agreed = (columns > -0.5) & (columns < width - 0.5) & (abs(there_px - right_px) <= 1)
-    return np.where(agreed, there, np.float32(0.2) * there)
-
-
 def plain_pick(sums, first_px):
     """Return the disparities of least cost."""
     count = sums.shape[2]

@@ -1,7 +1,7 @@
 import cv2
 import numpy as np
 import pytest
-from plain_refining import plain_census, plain_costs, plain_pick, plain_right_trust, plain_settled, plain_sums
+from plain_refining import plain_census, plain_costs, plain_pick, plain_settled, plain_sums
 
 from stereoweave.errors import StereoweaveError
 from stereoweave.matching import refine as refining
@@ -316,12 +316,6 @@ def test_both_views_settle_as_the_plain_ones(rng):
     expected = plain_settled(given.right_disparity_px, *found_px[::-1], np.float32(0.7) * right_trust, 1)
     np.testing.assert_array_equal(refined.right_disparity_px, expected)
     assert (refined.disparity_px != given.disparity_px).any()
-
-
-def test_the_right_view_gets_the_confidence_that_the_plain_reference_gives_it(rng):
-    _, _, given = random_pair(rng)
-    maps = given.right_disparity_px, given.disparity_px, given.confidence
-    np.testing.assert_array_equal(refining.right_confidence(given), plain_right_trust(*maps))
 
 
 def test_the_right_view_has_a_fifth_of_the_confidence_where_its_match_is_of_another_surface():

@@ -3,7 +3,6 @@ import os
 import threading
 from contextvars import ContextVar
 
-import numpy as np
 import pytest
 
 from stereoweave.errors import StereoweaveError
@@ -59,7 +58,7 @@ def test_bands_cover_all_rows_once_in_the_caller_s_context():
 )
 def test_even_bands_cover_all_rows_and_have_about_the_same_work(amounts, threads, bands):
     seen = []
-    in_even_bands(lambda *rows: seen.append(rows), np.array(amounts), threads)
+    in_even_bands(lambda *rows: seen.append(rows), amounts, threads)
     assert sorted(seen) == bands
 
 
