@@ -99,7 +99,7 @@ def _work_through(work: Callable[[int, int], None], ends: Sequence[int], threads
         other.result()
 
 
-def run_together(functions: Sequence[Callable[[], Result]], threads: int) -> list[Result]:
+def run_together(functions: Sequence[Callable[[], Any]], threads: int) -> list[Any]:
     """Return what each function returns; up to `threads` of them run at once."""
     results: list[Any] = [None] * len(functions)
 
