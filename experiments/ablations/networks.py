@@ -21,8 +21,7 @@ from stereoweave.learn.models.weave import (
     Aggregation,
     WeaveFeatures,
     WeaveNet,
-    as_left_view,
-    as_other_view,
+    as_matched_pixels,
 )
 
 
@@ -79,7 +78,7 @@ class GroupedWeaveNet(WeaveNet):
         match = self.to_match(maps.quarter)
         batch = match.shape[0] // 2
         volumes = [
-            correlation_volume(as_left_view(group, batch), as_other_view(group, batch), self.levels)
+            correlation_volume(*as_matched_pixels(group, batch), self.levels)
             for group in match.chunk(self.groups, 1)
         ]
         correlation = torch.stack(volumes).sum(0)

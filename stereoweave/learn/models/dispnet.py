@@ -68,7 +68,8 @@ def mean_correlation(
     first: Float[Tensor, "b c h w"], second: Float[Tensor, "b c h w"]
 ) -> Float[Tensor, "b 41 h w"]:
     """Return the channel mean of column x of `first` times column x - d of `second`, for d = 0 .. 40."""
-    return correlation_volume(first, second, LEVELS) / first.shape[1]
+    volume = correlation_volume(first.permute(0, 2, 3, 1), second.permute(0, 2, 3, 1), LEVELS)
+    return volume / first.shape[1]
 
 
 def enlarge(map_: Float[Tensor, "b c h w"], scale: int) -> Float[Tensor, "b c h2 w2"]:

@@ -18,6 +18,7 @@ from stereoweave.learn.models.layers import (
     ConvBlock,
     DilatedDense,
     Halve,
+    HalveImage,
     Residual,
     correlate_nearby,
     correlate_warped,
@@ -26,6 +27,7 @@ from stereoweave.learn.models.layers import (
     local_soft_argmax,
     mean_around,
     mirror,
+    pixel_shuffle,
     upsample_convex,
     upsample_to_a_side,
     zero_initialise,
@@ -174,30 +176,20 @@ class WeaveFeatures(NamedTuple):
     sixteenth: Tensor
 
 
-def as_left_view(views: Tensor, batch: int | torch.SymInt, columns: int = 3) -> Tensor:
-    """Return the maps of the left views, then the mirrored maps of the right views.
-
-    `columns` is the axis of the columns.
-    """
-    return torch.cat([views[:batch], mirror(views[batch:], columns)])
-
-
-def as_other_view(views: Tensor, batch: int | torch.SymInt, columns: int = 3) -> Tensor:
-    """Return the maps of the right views, then the mirrored maps of the left views.
-
-    `columns` is the axis of the columns.
-    """
-    return torch.cat([views[batch:], mirror(views[:batch], columns)])
+def as_left_view(views: Tensor, batch: int | torch.SymInt) -> Tensor:
+    """Return the maps of the left views, then the mirrored maps of the right views."""
+    return torch.cat([views[:batch], mirror(views[batch:])])
 
 
 def as_matched_pixels(match: Tensor, batch: int | torch.SymInt) -> tuple[Tensor, Tensor]:
-    """Return features in both arrangements, `as_left_view` and `as_other_view`, each [2B, H, W, C].
+    """Return features as `as_left_view`, and those of the other views to match, each [2B, H, W, C].
 
-    ONNX Runtime mirrors maps faster in this order of pixels: it copies all channels of a pixel at once, and
-    otherwise number by number.
+    The other views are the right views, then the mirrored left views. ONNX Runtime mirrors maps faster in
+    this order of pixels: it copies all channels of a pixel at once, and otherwise number by number.
     """
     pixels = match.permute(0, 2, 3, 1)
-    return as_left_view(pixels, batch, columns=2), as_other_view(pixels, batch, columns=2)
+    left, right = pixels[:batch], pixels[batch:]
+    return torch.cat([left, mirror(right, columns=2)]), torch.cat([right, mirror(left, columns=2)])
 
 
 def stack_convolutions(channels: int, count: int) -> list[nn.Module]:
@@ -217,7 +209,7 @@ class Encoder(nn.Module):
         super().__init__()
         half, quarter, eighth, sixteenth = size.channels
         counts = size.convolutions
-        self.down_to_half = nn.Sequential(Halve(3, half, kernel=4), *stack_convolutions(half, counts[0]))
+        self.down_to_half = nn.Sequential(HalveImage(3, half, kernel=4), *stack_convolutions(half, counts[0]))
         self.down_to_quarter = nn.Sequential(Halve(half, quarter), *stack_convolutions(quarter, counts[1]))
         self.down_to_eighth = nn.Sequential(Halve(quarter, eighth), *stack_convolutions(eighth, counts[2]))
         self.down_to_sixteenth = nn.Sequential(
@@ -228,7 +220,7 @@ class Encoder(nn.Module):
         self.join = ConvBlock(quarter, quarter, kernel=size.join_kernel)
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> WeaveFeatures:
-        half = self.down_to_half(image * 2 - 1)
+        half = self.down_to_half(image)
         quarter = self.down_to_quarter(half)
         eighth = self.down_to_eighth(quarter)
         sixteenth = self.down_to_sixteenth(eighth)
@@ -327,7 +319,7 @@ class Refinement(nn.Module):
         matches = self.matches(first, second, disparity, self.radius)
         x = self.body(self.join(torch.cat([matches, context, decoded], 1)))
         correction = expected_step((matches + self.scores(x)).float())
-        return disparity + correction, self.weights(x), F.pixel_shuffle(self.confidence(x), 2)
+        return disparity + correction, self.weights(x), pixel_shuffle(self.confidence(x))
 
 
 class WeaveNet(nn.Module):
@@ -398,7 +390,7 @@ class WeaveNet(nn.Module):
             disparity=self.upsample_coarse(spread * 2, logits),
             context=maps.half,
             match=self.to_match_half(maps.half),
-            handed=F.pixel_shuffle(self.to_half(decoded), 2),
+            handed=pixel_shuffle(self.to_half(decoded)),
             upsampling_logits=(logits,),
         )
 
@@ -433,7 +425,7 @@ class WeaveNet(nn.Module):
         """
         match = self.to_match(maps.quarter)
         batch = match.shape[0] // 2
-        correlation = correlation_volume(as_left_view(match, batch), as_other_view(match, batch), self.levels)
+        correlation = correlation_volume(*as_matched_pixels(match, batch), self.levels)
         return correlation, *self.aggregation(correlation, first)
 
     def upsample(self, x: Tensor, weights: Tensor) -> Tensor:
@@ -475,6 +467,6 @@ class WeaveNet(nn.Module):
             coarse.handed[:batch],
         )
         left_px = self.upsample(fine * 2, logits)
-        right_px = mirror(F.interpolate(coarse.disparity[batch:] * 2, scale_factor=2.0))
+        right_px = F.interpolate(mirror(coarse.disparity[batch:]) * 2, scale_factor=2.0)
         # Noise at infinity has both signs, but parallel cameras have no negative disparities.
         return left_px.clamp(min=0), right_px.clamp(min=0), confidence_logit

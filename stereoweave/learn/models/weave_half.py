@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from stereoweave.learn.models.layers import Halve, mean_around, upsample_convex
+from stereoweave.learn.models.layers import HalveImage, mean_around, upsample_convex
 from stereoweave.learn.models.weave import (
     BASE_GROWN,
     SMALL,
@@ -75,7 +75,7 @@ class WeaveHalfNet(WeaveNet):
         super().__init__(size, levels)
         self.multiple_of *= 2
         half = SMALL.channels[0]
-        self.stem = Halve(3, half, kernel=4)
+        self.stem = HalveImage(3, half, kernel=4)
         self.to_match_stem = nn.Conv2d(half, SMALL.compared, 1)
         self.enlargement = Enlargement()
 
@@ -95,7 +95,7 @@ class WeaveHalfNet(WeaveNet):
         """
         inner = super().estimate_coarse(_halve(left), _halve(right))
         fine, confidence_logit, logits = self.refine_both(inner, self.refinement)
-        stem = self.stem(torch.cat([left, right]) * 2 - 1)
+        stem = self.stem(torch.cat([left, right]))
         return replace(
             inner,
             disparity=self.upsample_coarse(fine * 2, logits),

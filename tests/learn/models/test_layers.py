@@ -7,6 +7,7 @@ from torch import nn
 from stereoweave.learn.models.layers import (
     DilatedDense,
     Halve,
+    HalveImage,
     Residual,
     correlate_nearby,
     correlate_warped,
@@ -17,6 +18,7 @@ from stereoweave.learn.models.layers import (
     local_soft_argmax,
     mean_around,
     mirror,
+    pixel_shuffle,
     sample_at_match,
     soft_argmin,
     upsample_convex,
@@ -90,23 +92,25 @@ def scores(levels, **likelihood):
     return logits
 
 
+def as_pixels(maps):
+    """Return maps [B, C, H, W] with the channels of a pixel side by side [B, H, W, C]."""
+    return maps.permute(0, 2, 3, 1)
+
+
 @pytest.mark.parametrize("width", [4, 9, 12])
 @pytest.mark.parametrize("levels", [1, 4, 9, 13])
 def test_the_fast_correlation_equals_the_plain_one(levels, width):
     first, second = torch.randn(2, 2, 5, 3, width)
     expected = correlation_volume_plain(first, second, levels)
-    torch.testing.assert_close(correlation_volume(first, second, levels), expected)
+    found = correlation_volume(as_pixels(first), as_pixels(second), levels)
+    torch.testing.assert_close(found, expected)
 
 
 def test_the_correlation_is_greatest_at_the_shift_between_the_maps():
     first = nn.functional.normalize(torch.randn(1, 16, 4, 20), dim=1)
     second = first.roll(-3, 3)  # column x of `first` is at x - 3 in `second`
-    assert (correlation_volume(first, second, 8).argmax(1)[..., 3:] == 3).all()
-
-
-def as_pixels(maps):
-    """Return maps [B, C, H, W] with the channels of a pixel side by side [B, H, W, C]."""
-    return maps.permute(0, 2, 3, 1)
+    volume = correlation_volume(as_pixels(first), as_pixels(second), 8)
+    assert (volume.argmax(1)[..., 3:] == 3).all()
 
 
 @pytest.mark.parametrize("radius", [1, 2])
@@ -120,8 +124,9 @@ def test_nearby_matches_equal_the_plain_loop_between_columns_and_beyond_the_bord
 
 def test_nearby_matches_at_whole_disparities_are_those_of_the_correlation_volume():
     first, second = torch.randn(2, 1, 4, 2, 12)
+    first, second = as_pixels(first), as_pixels(second)
     volume = correlation_volume(first, second, 7)
-    found = correlate_nearby(as_pixels(first), as_pixels(second), torch.full((1, 1, 2, 12), 4.0), radius=2)
+    found = correlate_nearby(first, second, torch.full((1, 1, 2, 12), 4.0), radius=2)
     torch.testing.assert_close(found[..., 6:], volume[:, 2:7, :, 6:])
 
 
@@ -253,6 +258,18 @@ def test_halving_keeps_the_grid_its_own_mirror_image(kernel):
     image = torch.rand(1, 3, 8, 12)
     assert halve(image).shape == (1, 4, 4, 6)
     torch.testing.assert_close(halve(mirror(image)), mirror(halve(image)))
+
+
+def test_halving_an_image_is_halving_its_values_mapped_to_both_sides_of_zero():
+    image = torch.rand(2, 3, 8, 10)
+    layer = HalveImage(3, 5, kernel=4).eval()
+    assert torch.equal(layer(image), nn.Sequential(*layer)(2 * image - 1))
+
+
+@pytest.mark.parametrize("channels", [4, 28])
+def test_the_pixels_of_four_channels_are_interleaved_as_by_pytorch(channels):
+    x = torch.randn(2, channels, 3, 5)
+    assert torch.equal(pixel_shuffle(x), nn.functional.pixel_shuffle(x, 2))
 
 
 def test_dense_blocks_pass_on_their_input_before_the_channels_that_they_add():
