@@ -274,7 +274,9 @@ def correlate_warped(
     warped = low + (columns - below).view(-1, 1).to(low.dtype) * (high - low)
     warped = F.pad(warped.view(batch, height, width, channels), (0, 0, radius, radius))
     steps = range(2 * radius, -1, -1)
-    return torch.cat([(first * warped[:, :, x : x + width]).sum(3).unsqueeze(1) for x in steps], 1)
+    return torch.cat(
+        [(first * warped[:, :, x : x - 2 * radius or None]).sum(3).unsqueeze(1) for x in steps], 1
+    )
 
 
 def sample_at_match(
@@ -305,11 +307,10 @@ def gather_neighbours(
     x: Float[Tensor, "b 1 h w"], offsets: Sequence[tuple[int, int]]
 ) -> Float[Tensor, "b k h w"]:
     """Return the map's values at (row, column) offsets from each pixel; the border is repeated."""
-    height, width = x.shape[2:]
     reach = max(abs(side) for offset in offsets for side in offset)
     around = F.pad(x, (reach, reach, reach, reach), mode="replicate")
     return torch.cat(
-        [around[:, :, reach + y : reach + y + height, reach + x : reach + x + width] for y, x in offsets], 1
+        [around[:, :, reach + y : y - reach or None, reach + x : x - reach or None] for y, x in offsets], 1
     )
 
 
@@ -385,11 +386,10 @@ def _neighbours(x: Tensor, weights: Tensor) -> tuple[list[Tensor], tuple[Tensor,
     The shapes are [B, 1, H, W] and [B, 4, H, W] for nine neighbours. For four neighbours, both shapes are
     [B, 4, H, W].
     """
-    channels, height, width = weights.shape[1:]
     around = F.pad(x, (1, 1, 1, 1), mode="replicate")
-    shifted = [around[:, :, dy : dy + height, dx : dx + width] for dy in range(3) for dx in range(3)]
-    logits = weights.chunk(channels // 4, 1)
-    if channels == 9 * 4:
+    shifted = [around[:, :, dy : dy - 2 or None, dx : dx - 2 or None] for dy in range(3) for dx in range(3)]
+    logits = weights.chunk(weights.shape[1] // 4, 1)
+    if len(logits) == 9:
         return shifted, logits
     # Old pixel (a, b) of the enclosing 2x2, for new pixel (i, j) of the 2x2 that replace an old pixel.
     corners = [(0, 0), (0, 1), (1, 0), (1, 1)]
