@@ -238,14 +238,14 @@ def _match_views(
     """Match both views, and return the disparities of least cost in each view."""
     left_px, right_px = estimate.disparity_px, estimate.right_disparity_px
     first_px, count = _candidates(left_px, right_px)
-    left, right = run_together(
+    left, right, searched = run_together(
         [
             partial(_cues, images[0], left_px, first_px, estimate.confidence),
             partial(_cues, images[1], right_px, first_px, _COARSE * right_trust),
+            partial(find_searched, left_px, estimate.confidence, -1, extent),
         ],
         threads,
     )
-    searched = find_searched(left_px, estimate.confidence, -1, extent)
     left_view = _View(left, _align(right, first_px, count, -1, threads), searched, -1)
     found_px = _match_view(left_view, first_px, count, threads)
     right_searched = find_matches_of_found(estimate.disparity_px, found_px, extent.reach_px)
@@ -273,10 +273,15 @@ def _match_strip(strip: _View, first_px: int, count: int, threads: int) -> Float
 
     own, other, _, towards = strip
     searched = strip.searched.view(np.uint8)
-    search, size = _choose_candidates(strip, count)
+    (search, size), steps_along, steps_down = run_together(
+        [
+            partial(_choose_candidates, strip, count),
+            partial(_penalise_steps, own.grey, 1),
+            partial(_penalise_steps, own.grey, 0),
+        ],
+        threads,
+    )
     costs, sums = np.empty(size, np.uint8), np.empty(size, np.uint16)
-    before = (own.grey.take([0, *range(own.grey.shape[axis] - 1)], axis) for axis in (1, 0))
-    steps_along, steps_down = (penalise_large_steps(own.grey, grey) for grey in before)
     found_px = np.empty(own.grey.shape, np.float32)
 
     def match(first: int, last: int) -> None:
@@ -291,6 +296,11 @@ def _match_strip(strip: _View, first_px: int, count: int, threads: int) -> Float
     in_even_bands(match, per_row.ravel().tolist(), threads)
     in_even_bands(pick, per_column.ravel().tolist(), threads)
     return found_px
+
+
+def _penalise_steps(grey: UInt8[np.ndarray, "h w"], axis: int) -> UInt8[np.ndarray, "h w"]:
+    """Return each pixel's penalty for a large step from the one before along an axis."""
+    return penalise_large_steps(grey, grey.take([0, *range(grey.shape[axis] - 1)], axis))
 
 
 def _candidates(*both: Float[np.ndarray, "h w"]) -> tuple[int, int]:
