@@ -415,14 +415,11 @@ def settle(found_px, other_px, trust, towards, disparity_px, agreed):
     for y in range(height):
         for x in range(width):
             found = found_px[y, x]
-            column = np.int32(np.rint(x + towards * found))
-            # No branches, so that the loop can be vectorised.
-            inside = (column >= 0) & (column < width)
-            seen_px = other_px[y, min(max(column, 0), width - 1)]
-            agreed[y, x] = inside & (abs(seen_px - found) <= AGREED_PX)
-            own_px = disparity_px[y, x]
-            replaced = agreed[y, x] & (abs(own_px - found) > PRECISE_PX) & (trust[y, x] < CERTAIN)
-            disparity_px[y, x] = found if replaced else own_px
+            column = np.int64(np.rint(x + towards * found))
+            agreed[y, x] = 0 <= column < width and abs(other_px[y, column] - found) <= AGREED_PX
+            imprecise = abs(disparity_px[y, x] - found) > PRECISE_PX
+            if agreed[y, x] and imprecise and trust[y, x] < CERTAIN:
+                disparity_px[y, x] = found
 
 
 @kernel
