@@ -36,7 +36,8 @@ _CANDIDATES_MULTIPLE = 16
 _CANDIDATES_AT_ONCE = 100_000_000
 _OVERLAP_PX = 64  # two tiles
 _BESIDE = np.ones((1, 3), np.uint8)
-# Pixels whose match lies farther than this outside the other image are not searched: nothing matches them.
+# Pixels whose match, by the network's disparity, lies farther than this outside the other image are not
+# searched. Most have no match; where the network errs, one inside may be missed (lab notebook, 2026-11-29).
 _OUTSIDE_PX = 2
 # A tile's first candidate is the least disparity in it and in the eight tiles around it. Nearer surfaces are
 # searched everywhere, because what the network misses is nearer than what is around it.
