@@ -134,7 +134,7 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(0)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def testdata() -> Path:
     """Return the folder of real pictures and the referee, for tests with the marker `testdata`."""
     return TESTDATA

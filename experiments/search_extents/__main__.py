@@ -16,7 +16,6 @@ def search_extents(
     folders: Annotated[list[Path], typer.Argument(help="Folders of pairs, as for stereoweave bench pairs.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="CSV file to write.")] = Path("search_extents.csv"),
     model: Annotated[str, typer.Option(help="Shipped network.")] = "small",
-    every: Annotated[int, typer.Option(min=1, help="Score one of so many pairs of each folder.")] = 1,
 ) -> None:
     """Score a network's estimates without a search, and searched once more to several extents.
 
@@ -25,7 +24,7 @@ def search_extents(
     from experiments.search_extents.scoring import score_extents
 
     make_parent_folder(out)
-    write_and_print(out, "Errors", [row for folder in folders for row in score_extents(folder, model, every)])
+    write_and_print(out, "Errors", [row for folder in folders for row in score_extents(folder, model)])
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

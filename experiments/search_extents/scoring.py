@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from stereoweave.bench.metrics import bad_percent, d1_percent, epe_px
-from stereoweave.data.readers import Scene, list_scenes
+from stereoweave.data.readers import Scene, read_scenes
 from stereoweave.matching.estimate import match
 from stereoweave.matching.matcher import Matcher
 from stereoweave.matching.occlusion_fill import fill_occluded
@@ -56,20 +56,19 @@ class ExtentRow:
     d1_percent: float
 
 
-def score_extents(folder: Path, model: str, every: int = 1) -> list[ExtentRow]:
-    """Return a row for each of EXTENTS, over one of `every` pairs of a folder.
+def score_extents(folder: Path, model: str) -> list[ExtentRow]:
+    """Return a row for each of EXTENTS, over the pairs of a folder.
 
     The pairs need no content masks. After the search, estimates are finished as by `Matcher.finish`, but no
     edges are settled by vote. A pair that the network sees at another size is searched at its own size.
     """
-    estimated = list(_estimate_scenes(folder, Matcher(model), every))
+    estimated = list(_estimate_scenes(folder, Matcher(model)))
     return [_average(folder.name, estimated, extent) for extent in EXTENTS]
 
 
-def _estimate_scenes(folder: Path, matcher: Matcher, every: int) -> Iterator[tuple[Scene, Estimate]]:
+def _estimate_scenes(folder: Path, matcher: Matcher) -> Iterator[tuple[Scene, Estimate]]:
     """Yield the pairs, with the network's own estimate."""
-    for read in list_scenes(folder)[::every]:
-        scene = read()
+    for scene in read_scenes(folder):
         yield scene, match(matcher, scene.pair, MatchOptions(raw=True))
 
 

@@ -1,5 +1,3 @@
-from functools import cache
-
 import numpy as np
 import pytest
 
@@ -12,14 +10,18 @@ from stereoweave.matching.refine import NARROW
 pytestmark = pytest.mark.testdata
 
 
-@cache
-def score_first_pair(folder):
-    return score_extents(folder, "small", every=12)
+@pytest.fixture(scope="module")
+def folder(testdata, tmp_path_factory):
+    """Return a folder of one real pair."""
+    pairs = tmp_path_factory.mktemp("extents") / "pairs"
+    pairs.mkdir()
+    (pairs / "cones").symlink_to(testdata.resolve() / "stereo" / "pairs" / "cones")
+    return pairs
 
 
-@pytest.fixture
-def rows(testdata):
-    return score_first_pair(testdata / "stereo" / "pairs")
+@pytest.fixture(scope="module")
+def rows(folder):
+    return score_extents(folder, "small")
 
 
 def test_there_is_a_row_for_each_extent_and_a_wider_one_searches_more(rows):
@@ -35,8 +37,8 @@ def test_a_search_lowers_the_errors_of_a_real_pair(rows):
     assert narrow.bad2_percent < nowhere.bad2_percent
 
 
-def test_the_narrow_search_is_that_of_the_matcher(rows, testdata):
-    scene = next(read_scenes(testdata / "stereo" / "pairs"))
+def test_the_narrow_search_is_that_of_the_matcher(rows, folder):
+    scene = next(read_scenes(folder))
     found = Matcher("small").estimate(scene.pair.left, scene.pair.right)
     expected = bad_percent(found.disparity_px, scene.truth_px, 1)
     np.testing.assert_allclose(rows[EXTENTS.index(NARROW)].bad1_percent, expected, rtol=1e-6)
