@@ -96,6 +96,20 @@ class ServiceJob:
         return replace(self.options, refined=True) if self.is_view else self.options
 
 
+_SAMPLE = Path(__file__).parents[1] / "sample"
+SAMPLE_JOB = ServiceJob(
+    folder=_SAMPLE, pictures=(_SAMPLE / "left.jpg", _SAMPLE / "right.jpg"), file="disparity.png"
+)
+"""The disparity of the pair that ships with the package."""
+_EVERY_OPTION = replace(
+    SAMPLE_JOB,
+    file="view.png",
+    request=Request(rectify=True),
+    options=MatchOptions(refined=True),
+    checked=True,
+)
+
+
 @dataclass(frozen=True, kw_only=True)
 class ServiceAnswer:
     """The bytes of a file, and a JSON report with the fields of `Summary` and the notes."""
@@ -145,8 +159,13 @@ def load_measurer() -> Callable[[ServiceJob], float]:
 
 
 def load_answerer(backend: Backend) -> BatchAnswerer:
-    """Load the network, and return the function with which a `ChildProcess` answers jobs."""
-    return partial(answer_many, backend.matcher())
+    """Load the network and all kernels, and return the function with which a `ChildProcess` answers jobs.
+
+    A process has started when this returns, so no request waits for kernels to be loaded.
+    """
+    matcher = backend.matcher()
+    answer_many(matcher, [_EVERY_OPTION])
+    return partial(answer_many, matcher)
 
 
 def answer_many(matcher: Matcher, jobs: Sequence[ServiceJob]) -> list[ServiceAnswer | Exception]:

@@ -1,4 +1,6 @@
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -75,7 +77,7 @@ def test_a_job_past_its_deadline_is_not_started(processes):
 
 def test_matching_is_ended_at_its_deadline_and_the_next_job_is_answered(tmp_path):
     processes = ReplicaProcesses(partial(load_answerer, Backend(threads=1)), tmp_path / "files")
-    assert 0 < processes.warm_up() < 60
+    assert 0 < processes.measure_speed() < 60
     assert list_names(processes.answer([make_job(within_s=0.01)])) == ["TimeoutError"]
     (answer,) = processes.answer([make_job()])
     assert answer.content.startswith(b"\x89PNG")
@@ -118,8 +120,23 @@ def test_a_picture_is_not_blamed_for_a_process_that_is_still_starting(tmp_path, 
     processes.close()
 
 
+LOADED = """
+from stereoweave.matching import occlusion_fill_kernels, refine_kernels, subpixel_kernels
+from stereoweave.matching.backend import Backend
+from stereoweave.service.answers import load_answerer
+load_answerer(Backend(model="small"))
+print(refine_kernels.match.loads, subpixel_kernels.compare.loads, occlusion_fill_kernels.fill_rows.loads)
+"""
+
+
+def test_a_process_has_loaded_its_kernels_before_its_first_job():
+    for _ in range(2):  # the first process may have compiled them instead
+        done = subprocess.run([sys.executable, "-c", LOADED], capture_output=True, text=True, check=True)
+    assert done.stdout == "1 1 1\n"
+
+
 def test_a_network_that_cannot_be_loaded_is_reported_before_any_job(tmp_path):
     processes = ReplicaProcesses(partial(load_answerer, Backend(model="none.onnx")), tmp_path / "files")
     with pytest.raises(MatcherError, match=r"none\.onnx: expected an ONNX matcher file"):
-        processes.warm_up()
+        processes.measure_speed()
     processes.close()
