@@ -30,7 +30,7 @@ from stereoweave.service.answers import (
     strip_paths,
 )
 from stereoweave.service.forms import MapForm, PairForm, ViewForm, store_uploads
-from stereoweave.system.child_process import ProcessDiedError
+from stereoweave.system.child_process import NotStartedError, ProcessDiedError
 
 # Some pending requests will have finished by then.
 _RETRY_AFTER_S = 1
@@ -59,8 +59,8 @@ _REFUSALS: dict[int | str, dict[str, Any]] = {
         413: "More bytes or pixels than accepted, or more work than the time limit allows.",
         415: "Content type other than multipart/form-data.",
         422: "Unknown, missing or invalid field.",
-        503: "Busy: retry after the number of seconds in the header Retry-After. Also returned if the disk, "
-        "the memory, the provider or a worker process fails.",
+        503: "Busy, or a worker process is starting: retry after the number of seconds in the header "
+        "Retry-After. Also returned if the disk, the memory, the provider or a worker process fails.",
         504: "No response within the time limit.",
     }.items()
 }
@@ -245,7 +245,8 @@ def _make_response(answer: ServiceAnswer, name: str) -> Response:
 
 
 def _make_http_exception(error: Exception, folder: Path) -> HTTPException:
-    headers = {"Retry-After": str(error.retry_after_s)} if isinstance(error, BusyError) else None
+    retry_after_s = error.retry_after_s if isinstance(error, BusyError) else _RETRY_AFTER_S
+    headers = {"Retry-After": str(retry_after_s)} if isinstance(error, BusyError | NotStartedError) else None
     detail = strip_paths(format_error(error, field_name), folder)
     if not isinstance(error, StereoweaveError | TimeoutError):
         found = detail or "too little memory"
@@ -259,7 +260,7 @@ def _find_status(error: Exception) -> int:
             return 413
         case FormatError():
             return 400
-        case MatcherError() | ProcessDiedError() | BusyError():
+        case MatcherError() | ProcessDiedError() | BusyError() | NotStartedError():
             return 503
         case TimeoutError():
             return 504

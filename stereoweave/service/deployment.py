@@ -145,7 +145,8 @@ class Replica:
             answers = await loop.run_in_executor(self._answering_thread, self._processes.answer, timed_jobs)
         finally:
             self._idle.set()
-        if all(isinstance(answer, ServiceAnswer | TimeoutError) for answer in answers):
+        # Not NotStartedError: a process that was still starting has done no work.
+        if all(type(answer) in (ServiceAnswer, TimeoutError) for answer in answers):
             work = sum(self._budget.estimate_work(timed.job, timed.megapixels) for timed in timed_jobs)
             finished = all(isinstance(answer, ServiceAnswer) for answer in answers)
             self._budget.learn(work, time.perf_counter() - start_s, finished=finished)

@@ -17,6 +17,9 @@ from typing import Any
 
 from stereoweave.errors import StereoweaveError
 
+# Part of a call's time that may pass before its process has started. The rest is left to the call itself.
+_STARTING_SHARE = 0.5
+
 Function = Callable[[Any], Any]
 _Reply = tuple[Any, Exception | None]
 
@@ -26,7 +29,7 @@ class ProcessDiedError(StereoweaveError):
 
 
 class NotStartedError(TimeoutError):
-    """Error for a call that was not begun in time: the process was still starting, or no time was left."""
+    """Error for a call that was not begun because its process was still starting."""
 
 
 class ChildProcess:
@@ -47,17 +50,19 @@ class ChildProcess:
         """Call the function for at most `timeout_s` seconds, and return its result.
 
         Raises:
-            NotStartedError: If the process has not started in time, or no time is left.
-            TimeoutError: If the call takes too long; the process is then replaced.
+            NotStartedError: If the process has not started within half of this time.
+            TimeoutError: If the call takes too long; the process is then replaced. Also if no time is left.
             ProcessDiedError: If the process exits on its own; it is then replaced.
             Exception: Any error that the function or `make` raises.
         """
-        start_s = time.monotonic()
-        wait([self._started], timeout_s)
-        left_s = None if timeout_s is None else start_s + timeout_s - time.monotonic()
         late = f"expected a result within {timeout_s or 0:.3g} s, found none"
-        if not self._started.done() or (left_s is not None and left_s <= 0):
-            raise NotStartedError(late)
+        if timeout_s is not None and timeout_s <= 0:
+            raise TimeoutError(late)
+        start_s = time.monotonic()
+        wait([self._started], None if timeout_s is None else _STARTING_SHARE * timeout_s)
+        if not self._started.done():
+            raise NotStartedError("the process that answers is still starting; try again later")
+        left_s = None if timeout_s is None else start_s + timeout_s - time.monotonic()
         self._open(self._started)
         self._make_folder()
         reply = self._exchanges.submit(_exchange, self._process, pickle.dumps(argument))

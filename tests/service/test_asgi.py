@@ -14,7 +14,7 @@ from service_examples import BOTH
 from stereoweave.errors import ProviderError
 from stereoweave.service.admission import BusyError
 from stereoweave.service.answers import ServiceAnswer, ServiceJob, TooLargeError
-from stereoweave.system.child_process import ProcessDiedError
+from stereoweave.system.child_process import NotStartedError, ProcessDiedError
 
 # Pydantic warns about Ray Serve when that is imported.
 pytestmark = pytest.mark.filterwarnings("ignore:Using extra keyword arguments on `Field`:DeprecationWarning")
@@ -200,6 +200,7 @@ def test_work_for_a_client_that_disconnects_is_cancelled():
         (BusyError("busy", retry_after_s=7), 503, "7"),
         (ProcessDiedError("it crashed"), 503, None),
         (TimeoutError("late"), 504, None),
+        (NotStartedError("the process is still starting; try again later"), 503, "1"),
     ],
 )
 def test_each_kind_of_error_has_its_status(error, status, header):

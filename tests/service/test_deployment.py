@@ -236,14 +236,10 @@ def post_calibration(content: bytes, client: httpx.Client) -> tuple[int, str]:
 def send_until_accepted(send: Sender, client: httpx.Client) -> int:
     """Send a request until it is accepted, and return its status; 503 if this takes over five minutes.
 
-    Each slow request of the others takes the whole time limit of the service, one after another. One 504 is
-    excused: on a busy machine, the process that replaces a killed one may take the whole time limit to start.
+    Each slow request of the others takes the whole time limit of the service, one after another.
     """
-    deadline_s, excused = time.monotonic() + 300, 1
-    while (status := send(client)[0]) in (503, 504) and time.monotonic() < deadline_s:
-        if status == 504 and not excused:
-            break
-        excused -= status == 504
+    deadline_s = time.monotonic() + 300
+    while (status := send(client)[0]) == 503 and time.monotonic() < deadline_s:
         time.sleep(0.5)
     return status
 

@@ -81,10 +81,19 @@ def test_a_process_that_is_still_starting_is_not_replaced(tmp_path):
     child.close()
 
 
+def test_a_call_is_begun_only_if_half_of_its_time_is_left(tmp_path):
+    child = ChildProcess(partial(_sleep_then_make, 60), tmp_path / "files")
+    start_s = time.monotonic()
+    with pytest.raises(NotStartedError, match="is still starting; try again later"):
+        child(0, timeout_s=20)
+    assert 10 <= time.monotonic() - start_s < 15
+    child.close()
+
+
 def test_a_call_with_no_time_left_is_not_started(waiting):
     assert waiting(0, timeout_s=10) is None
     pid = waiting.pid
-    with pytest.raises(TimeoutError):
+    with pytest.raises(TimeoutError, match="expected a result within 0 s"):
         waiting(60, timeout_s=0)
     assert waiting.pid == pid
 
