@@ -182,10 +182,11 @@ def as_left_view(views: Tensor, batch: int | torch.SymInt) -> Tensor:
 
 
 def as_matched_pixels(match: Tensor, batch: int | torch.SymInt) -> tuple[Tensor, Tensor]:
-    """Return features as `as_left_view`, and those of the other views to match, each [2B, H, W, C].
+    """Return the features arranged as by `as_left_view`, and those that they are matched with.
 
-    The other views are the right views, then the mirrored left views. ONNX Runtime mirrors maps faster in
-    this order of pixels: it copies all channels of a pixel at once, and otherwise number by number.
+    The latter are of the right views, then of the mirrored left views. Both are [2B, H, W, C]. ONNX Runtime
+    mirrors maps faster in this order of pixels: it copies all channels of a pixel at once, and otherwise
+    number by number.
     """
     pixels = match.permute(0, 2, 3, 1)
     left, right = pixels[:batch], pixels[batch:]
