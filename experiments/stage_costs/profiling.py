@@ -162,6 +162,10 @@ def find_stages(graph: onnx.ModelProto) -> dict[str, str]:
     return stages
 
 
+# Operations that only add up what they read.
+_SUMS = {"ReduceSum", "Add"}
+
+
 def count_multiply_adds(graph: onnx.ModelProto) -> Counter[str]:
     """Return multiply-adds by node: convolutions, matrix products, and products that are only summed."""
     inferred = onnx.shape_inference.infer_shapes(graph).graph
@@ -179,7 +183,7 @@ def count_multiply_adds(graph: onnx.ModelProto) -> Counter[str]:
             counts[node.name] = given * prod(shapes[node.input[1]][1:])
         elif node.op_type == "MatMul":
             counts[node.name] = given * shapes[node.input[0]][-1]
-        elif node.op_type == "Mul" and readers[node.output[0]] == {"ReduceSum"}:
+        elif node.op_type == "Mul" and readers[node.output[0]] and readers[node.output[0]] <= _SUMS:
             counts[node.name] = given
     return counts
 

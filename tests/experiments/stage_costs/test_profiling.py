@@ -100,6 +100,8 @@ def test_multiply_adds_are_of_convolutions_products_and_sums_of_products():
             helper.make_node("Mul", ["a", "b"], ["summed"], "mul"),
             helper.make_node("ReduceSum", ["summed", "axis"], ["sum"], "sum"),
             helper.make_node("Mul", ["a", "b"], ["kept"], "mul_alone"),
+            helper.make_node("Mul", ["a", "a"], ["added"], "mul_of_column"),
+            helper.make_node("Add", ["added", "a"], ["both"], "add"),
         ],
         {
             "image": [1, 2, 5, 6],
@@ -109,12 +111,17 @@ def test_multiply_adds_are_of_convolutions_products_and_sums_of_products():
             "a": [7, 1],
             "b": [1, 8],
         },
-        ["maps", "product", "sum", "kept"],
+        ["maps", "product", "sum", "kept", "both"],
         [ones],
     )
     counts = costs.count_multiply_adds(graph)
-    # 4 maps of 5x6 from 2 at 3x3; 2x3x5 sums of 4 products; 7x8 products.
-    assert counts == {"conv": 4 * 5 * 6 * 2 * 9, "matmul": 2 * 3 * 5 * 4, "mul": 7 * 8}
+    # 4 maps of 5x6 from 2 at 3x3; 2x3x5 sums of 4 products; 7x8 products; 7 products.
+    assert counts == {
+        "conv": 4 * 5 * 6 * 2 * 9,
+        "matmul": 2 * 3 * 5 * 4,
+        "mul": 7 * 8,
+        "mul_of_column": 7,
+    }
 
 
 def test_a_product_of_matrices_moves_both_and_the_result_and_runs_every_turn():
