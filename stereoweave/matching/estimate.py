@@ -117,6 +117,12 @@ def _compile_ahead(matcher: Matcher, pairs: Sequence[StereoPair], options: Match
         compile_ahead(rehearse_upsampling)
 
 
+def load_kernels() -> None:
+    """Load all kernels of matching, so that the first pair does not wait for them."""
+    for rehearse in (rehearse_finishing, rehearse_refining, rehearse_voting, rehearse_upsampling):
+        rehearse()
+
+
 def _clip_to_width(range_px: tuple[float, float], width_px: int) -> tuple[float, float]:
     """Clip a disparity range to the disparities that are possible in images of this width."""
     low_px, high_px = range_px

@@ -16,6 +16,7 @@ from stereoweave.io.decoding import MOST_PIXELS, open_picture
 from stereoweave.io.images import write_image
 from stereoweave.io.maps import RangeError
 from stereoweave.matching.backend import Backend
+from stereoweave.matching.estimate import load_kernels
 from stereoweave.matching.matcher import Matcher
 from stereoweave.matching.options import MatchOptions
 from stereoweave.outputs.point_cloud import require_camera
@@ -96,20 +97,6 @@ class ServiceJob:
         return replace(self.options, refined=True) if self.is_view else self.options
 
 
-_SAMPLE = Path(__file__).parents[1] / "sample"
-SAMPLE_JOB = ServiceJob(
-    folder=_SAMPLE, pictures=(_SAMPLE / "left.jpg", _SAMPLE / "right.jpg"), file="disparity.png"
-)
-"""The disparity of the pair that ships with the package."""
-_EVERY_OPTION = replace(
-    SAMPLE_JOB,
-    file="view.png",
-    request=Request(rectify=True),
-    options=MatchOptions(refined=True),
-    checked=True,
-)
-
-
 @dataclass(frozen=True, kw_only=True)
 class ServiceAnswer:
     """The bytes of a file, and a JSON report with the fields of `Summary` and the notes."""
@@ -159,12 +146,12 @@ def load_measurer() -> Callable[[ServiceJob], float]:
 
 
 def load_answerer(backend: Backend) -> BatchAnswerer:
-    """Load the network and all kernels, and return the function with which a `ChildProcess` answers jobs.
+    """Load the network and the kernels of matching, and return the function that answers jobs.
 
-    A process has started when this returns, so no request waits for kernels to be loaded.
+    A `ChildProcess` has started when this returns, so no request waits for these kernels.
     """
     matcher = backend.matcher()
-    answer_many(matcher, [_EVERY_OPTION])
+    load_kernels()
     return partial(answer_many, matcher)
 
 

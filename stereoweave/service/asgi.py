@@ -245,8 +245,8 @@ def _make_response(answer: ServiceAnswer, name: str) -> Response:
 
 
 def _make_http_exception(error: Exception, folder: Path) -> HTTPException:
-    retry_after_s = error.retry_after_s if isinstance(error, BusyError) else _RETRY_AFTER_S
-    headers = {"Retry-After": str(retry_after_s)} if isinstance(error, BusyError | NotStartedError) else None
+    retry_after_s = error.retry_after_s if isinstance(error, BusyError | NotStartedError) else None
+    headers = {"Retry-After": str(retry_after_s)} if retry_after_s is not None else None
     detail = strip_paths(format_error(error, field_name), folder)
     if not isinstance(error, StereoweaveError | TimeoutError):
         found = detail or "too little memory"

@@ -101,7 +101,7 @@ class Replica:
         self._folder = self._resources.enter_context(make_own_folder())
         self._processes = _make_processes(settings, self._folder)
         self._resources.callback(self._processes.close)
-        self._budget = Budget(self._processes.measure_speed(), refines=settings.model in MODES)
+        self._budget = Budget(self._processes.warm_up(), refines=settings.model in MODES)
         # One thread per process: a call that waits for its thread has not been sent and can be cancelled.
         self._measuring_thread, self._answering_thread = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
         self._idle = asyncio.Event()
@@ -139,14 +139,14 @@ class Replica:
 
     async def _answer_batch(self, timed_jobs: list[TimedJob]) -> list[ServiceAnswer | Exception]:
         self._idle.clear()
-        start_s = time.perf_counter()
+        starting, start_s = self._processes.starting, time.perf_counter()
         try:
             loop = asyncio.get_running_loop()
             answers = await loop.run_in_executor(self._answering_thread, self._processes.answer, timed_jobs)
         finally:
             self._idle.set()
-        # Not NotStartedError: a process that was still starting has done no work.
-        if all(type(answer) in (ServiceAnswer, TimeoutError) for answer in answers):
+        # The time of a start tells nothing about the speed.
+        if not starting and all(isinstance(answer, ServiceAnswer | TimeoutError) for answer in answers):
             work = sum(self._budget.estimate_work(timed.job, timed.megapixels) for timed in timed_jobs)
             finished = all(isinstance(answer, ServiceAnswer) for answer in answers)
             self._budget.learn(work, time.perf_counter() - start_s, finished=finished)
@@ -310,7 +310,7 @@ def _try_start(settings: Settings) -> StereoweaveError | None:
     """Start a replica's processes as a trial; return the error, if any."""
     try:
         with make_own_folder() as folder, closing(_make_processes(settings, folder)) as processes:
-            processes.measure_speed()
+            processes.warm_up()
     except StereoweaveError as error:
         return error
     return None

@@ -2,15 +2,18 @@
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from stereoweave.errors import FormatError
-from stereoweave.service.answers import SAMPLE_JOB, BatchAnswerer, ServiceAnswer, ServiceJob, load_measurer
+from stereoweave.matching.options import MatchOptions
+from stereoweave.pictures.prepare import Request
+from stereoweave.service.answers import BatchAnswerer, ServiceAnswer, ServiceJob, load_measurer
 from stereoweave.system.child_process import ChildProcess, NotStartedError, ProcessDiedError
 
 # Reading a picture's header takes milliseconds.
 _MEASURING_LIMIT_S = 10
+_SAMPLE = Path(__file__).parents[1] / "sample"
 
 
 @dataclass(frozen=True)
@@ -45,31 +48,47 @@ class ReplicaProcesses:
         self._measurer.close()
         self._answerer.close()
 
-    def measure_speed(self) -> float:
-        """Return the time in seconds per megapixel for a disparity map.
+    def warm_up(self) -> float:
+        """Compile all kernels, and return the time in seconds per megapixel for a disparity map.
 
         Raises:
             MatcherError: If the network cannot be loaded.
         """
-        for _ in range(2):  # the first job waits for the process to start
+        pictures = (_SAMPLE / "left.jpg", _SAMPLE / "right.jpg")
+        plain = ServiceJob(folder=_SAMPLE, pictures=pictures, file="disparity.png")
+        every_option = replace(
+            plain,
+            file="view.png",
+            request=Request(rectify=True),
+            options=MatchOptions(refined=True),
+            checked=True,
+        )
+        for job in (every_option, plain):
             start_s = time.perf_counter()
-            (answer,) = self._answerer([SAMPLE_JOB], timeout_s=None)
+            (answer,) = self._answerer([job], timeout_s=None)
             took_s = time.perf_counter() - start_s
             if isinstance(answer, Exception):
                 raise answer
-        return took_s / self._measurer(SAMPLE_JOB, timeout_s=None)
+        return took_s / self._measurer(plain, timeout_s=None)
+
+    @property
+    def starting(self) -> bool:
+        """Whether the process that matches pictures is still starting."""
+        return self._answerer.starting
 
     def measure(self, job: ServiceJob, left_s: float) -> float:
         """Return the size of a job's pictures in megapixels, read from their headers.
 
         Raises:
             StereoweaveError: If `check_pixels` raises an error, or the process crashes.
-            TimeoutError: If this takes longer than `left_s`, or if the process is still starting.
+            NotStartedError: If the process is still starting after half of `left_s`.
+            TimeoutError: If this takes longer than `left_s`.
         """
+        deadline_s = time.monotonic() + left_s
+        self._measurer.wait_for_start(left_s)
+        left_s = deadline_s - time.monotonic()
         try:
             return self._measurer(job, min(left_s, _MEASURING_LIMIT_S))
-        except NotStartedError:
-            raise
         except TimeoutError as error:
             if left_s < _MEASURING_LIMIT_S:
                 raise
@@ -82,11 +101,13 @@ class ReplicaProcesses:
         """Return each job's answer or error.
 
         If the jobs miss the earliest of their deadlines, or the process crashes, the process is replaced and
-        the jobs are retried one by one.
+        the jobs are retried one by one. If it is still starting, they are not retried.
         """
         try:
             jobs = [timed.job for timed in timed_jobs]
             return self._answerer(jobs, min(timed.left_s for timed in timed_jobs))
+        except NotStartedError as error:
+            return [error] * len(timed_jobs)
         except (TimeoutError, ProcessDiedError) as error:
             if len(timed_jobs) == 1:
                 return [error]

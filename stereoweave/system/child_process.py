@@ -31,6 +31,8 @@ class ProcessDiedError(StereoweaveError):
 class NotStartedError(TimeoutError):
     """Error for a call that was not begun because its process was still starting."""
 
+    retry_after_s = 1
+
 
 class ChildProcess:
     """A function that runs in a child process, one call at a time.
@@ -56,12 +58,10 @@ class ChildProcess:
             Exception: Any error that the function or `make` raises.
         """
         late = f"expected a result within {timeout_s or 0:.3g} s, found none"
+        start_s = time.monotonic()
         if timeout_s is not None and timeout_s <= 0:
             raise TimeoutError(late)
-        start_s = time.monotonic()
-        wait([self._started], None if timeout_s is None else _STARTING_SHARE * timeout_s)
-        if not self._started.done():
-            raise NotStartedError("the process that answers is still starting; try again later")
+        self.wait_for_start(timeout_s)
         left_s = None if timeout_s is None else start_s + timeout_s - time.monotonic()
         self._open(self._started)
         self._make_folder()
@@ -71,6 +71,21 @@ class ChildProcess:
             self._replace()
             raise TimeoutError(late)
         return self._open(reply)
+
+    @property
+    def starting(self) -> bool:
+        """Whether the process is still starting."""
+        return not self._started.done()
+
+    def wait_for_start(self, timeout_s: float | None) -> None:
+        """Wait for the process to start for at most half of `timeout_s` seconds; the rest is for the call.
+
+        Raises:
+            NotStartedError: If the process is still starting then.
+        """
+        wait([self._started], None if timeout_s is None else _STARTING_SHARE * timeout_s)
+        if self.starting:
+            raise NotStartedError("a process that the request needs is still starting; try again later")
 
     @property
     def pid(self) -> int:
