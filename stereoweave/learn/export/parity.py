@@ -33,7 +33,7 @@ from stereoweave.system.threads import thread_count
 _SEED, _PAIRS = 7_000_003, 4
 # Height and width of the pairs. Times are measured at the last size, which is that of the fixed-size file.
 SIZES = ((256, 320), (320, 512), (480, 640))
-_TURNS = 7
+_TURNS = 21
 
 
 @dataclass(frozen=True, kw_only=True)
