@@ -197,6 +197,8 @@ def ray_head(cpus: int, **variables: str) -> Iterator[str]:
                 "RAY_USAGE_STATS_REPORT_URL": "http://127.0.0.1:9",
                 # Workers import modules of the tests.
                 "PYTHONPATH": os.pathsep.join(paths),
+                # Other tests keep all cores busy.
+                "RAY_worker_niceness": "0",
                 **variables,
             }
             head = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT, env=environment)

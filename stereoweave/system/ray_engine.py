@@ -46,6 +46,12 @@ _QUIET_ENVIRONMENT = {
 # its machine and listens only there. A loopback address passed to `ray.init` has no effect, because Ray
 # replaces it.
 _OPEN_TO_OTHER_MACHINES = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
+_LOCAL_ENVIRONMENT = {
+    _OPEN_TO_OTHER_MACHINES: "0",
+    # By default, Ray lowers the priority of its workers to 15: beside other programs that keep all cores busy
+    # they, and the processes that they start, would get a thirtieth of the time.
+    "RAY_worker_niceness": "0",
+}
 _INDEX, _CONTENT = "index", "content"
 
 
@@ -98,7 +104,8 @@ def set_environment(address: str | None) -> str | None:
     address = address or os.environ.get("RAY_ADDRESS")
     if address and address != "local":
         return address
-    os.environ.setdefault(_OPEN_TO_OTHER_MACHINES, "0")
+    for name, value in _LOCAL_ENVIRONMENT.items():
+        os.environ.setdefault(name, value)
     return None
 
 

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import httpx
 import numpy as np
+import psutil
 import pytest
 import watching
 from hostile_calibrations import HOSTILE
@@ -191,6 +192,16 @@ def test_a_full_service_refuses_requests_and_answers_the_accepted_ones(service):
     assert len(done) + len(late) >= WAITING
     assert {response.headers["Retry-After"] for response in full} == {"1"}
     assert all("try again later" in response.json()["detail"] for response in refused)
+
+
+def test_no_process_of_the_service_has_a_lower_priority_than_the_command(running):
+    priorities = {}
+    for pid in list_processes(running.pid):
+        with suppress(psutil.NoSuchProcess):
+            process = psutil.Process(pid)
+            priorities[process.name()] = process.nice()
+    assert len(priorities) > 3
+    assert set(priorities.values()) == {psutil.Process().nice()}, priorities
 
 
 def test_hostile_requests_and_calibrations_neither_delay_health_checks_nor_fill_memory(running):
