@@ -45,6 +45,7 @@ _STAGES_BETWEEN = {
     ("", "aggregation"): "disparity from scores",
     ("", "completion"): "completion",
     ("", "propagation"): "upsampling",
+    ("", "stem"): "upsampling",
     ("", "refinement"): "upsampling",
     ("refinement", "to_half"): "local matching",
 }

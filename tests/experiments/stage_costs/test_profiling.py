@@ -193,6 +193,19 @@ def test_the_convolutions_of_the_encoder_are_counted_there(rows):
     assert encoder.multiply_adds == counter.get_total_flops() // 2
 
 
+def test_only_the_encoder_and_the_stem_of_an_enlarging_network_count_as_encoder(monkeypatch):
+    monkeypatch.setattr(costs, "HEIGHT_PX", 64)
+    monkeypatch.setattr(costs, "WIDTH_PX", 128)
+    network = untrained("weave_half")
+    graph = costs.trace(network)
+    stages, counts = costs.find_stages(graph), costs.count_multiply_adds(graph)
+    with torch.no_grad(), torch.utils.flop_counter.FlopCounterMode(display=False) as counter:
+        network.encoder(torch.rand(2, 3, 32, 64))
+        network.stem(torch.rand(2, 3, 64, 128))
+    encoder = sum(count for node, count in counts.items() if stages[node] == "encoder")
+    assert encoder == counter.get_total_flops() // 2
+
+
 def test_the_table_has_a_line_for_each_row(rows):
     _, found = rows
     lines = costs.format_table(found).splitlines()
