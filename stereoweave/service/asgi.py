@@ -32,7 +32,7 @@ from stereoweave.service.answers import (
 from stereoweave.service.forms import MapForm, PairForm, ViewForm, store_uploads
 from stereoweave.system.child_process import NotStartedError, ProcessDiedError
 
-# Some pending requests will have finished by then.
+# Some pending requests will have finished by then, or a process will have started.
 _RETRY_AFTER_S = 1
 _LATENCIES_S = [0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 60]
 _PATHS = ("/disparity", "/depth", "/view")
@@ -245,13 +245,21 @@ def _make_response(answer: ServiceAnswer, name: str) -> Response:
 
 
 def _make_http_exception(error: Exception, folder: Path) -> HTTPException:
-    retry_after_s = error.retry_after_s if isinstance(error, BusyError | NotStartedError) else None
-    headers = {"Retry-After": str(retry_after_s)} if retry_after_s is not None else None
     detail = strip_paths(format_error(error, field_name), folder)
     if not isinstance(error, StereoweaveError | TimeoutError):
         found = detail or "too little memory"
         detail = f"the service could not store or process the request ({found}); try again later"
-    return HTTPException(_find_status(error), detail, headers)
+    return HTTPException(_find_status(error), detail, _find_retry(error))
+
+
+def _find_retry(error: Exception) -> dict[str, str] | None:
+    """Return the header that tells when to retry; None if there is no such time."""
+    match error:
+        case BusyError():
+            return {"Retry-After": str(error.retry_after_s)}
+        case NotStartedError():
+            return {"Retry-After": str(_RETRY_AFTER_S)}
+    return None
 
 
 def _find_status(error: Exception) -> int:

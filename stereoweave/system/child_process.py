@@ -31,8 +31,6 @@ class ProcessDiedError(StereoweaveError):
 class NotStartedError(TimeoutError):
     """Error for a call that was not begun because its process was still starting."""
 
-    retry_after_s = 1
-
 
 class ChildProcess:
     """A function that runs in a child process, one call at a time.
