@@ -3,6 +3,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -73,9 +74,9 @@ def load_late() -> BatchAnswerer:
 def test_no_job_of_a_batch_is_retried_while_the_process_is_starting(tmp_path):
     processes = ReplicaProcesses(load_late, tmp_path / "files")
     start_s = time.monotonic()
-    outcomes = processes.answer([make_job("first", within_s=4), make_job("second", within_s=4)])
+    outcomes = processes.answer([make_job("first", within_s=10), make_job("second", within_s=10)])
     assert list_names(outcomes) == ["NotStartedError", "NotStartedError"]
-    assert 1.9 < time.monotonic() - start_s < 4
+    assert 4.9 < time.monotonic() - start_s < 8  # two retries would take 2.5 s and 1.25 s more
     processes.close()
 
 
@@ -137,6 +138,22 @@ def test_a_picture_is_not_blamed_for_a_process_that_is_still_starting(tmp_path):
     processes = ReplicaProcesses(load_named_answerer, tmp_path / "files")
     with pytest.raises(NotStartedError, match="is still starting; try again later"):
         processes.measure(make_job().job, left_s=0.01)
+    processes.close()
+
+
+def test_the_time_of_a_start_is_not_part_of_the_limit_for_measuring(tmp_path, monkeypatch):
+    monkeypatch.setattr(replica_processes, "_MEASURING_LIMIT_S", 2)
+    others = set(psutil.Process().children())
+    processes = ReplicaProcesses(load_named_answerer, tmp_path / "files")
+    children = set(psutil.Process().children()) - others
+    for child in children:
+        child.suspend()
+    with ThreadPoolExecutor(1) as pool:
+        measured = pool.submit(processes.measure, make_job().job, left_s=60)
+        time.sleep(3)
+        for child in children:
+            child.resume()
+        assert measured.result() == pytest.approx(2 * 640 * 480 / 1e6)
     processes.close()
 
 
