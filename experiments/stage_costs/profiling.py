@@ -47,7 +47,9 @@ _STAGES_BETWEEN = {
     ("", "propagation"): "upsampling",
     ("", "stem"): "upsampling",
     ("", "refinement"): "upsampling",
+    ("", "enlargement"): "upsampling",
     ("refinement", "to_half"): "local matching",
+    ("enlargement", "to_match_stem"): "local matching",
 }
 # Kernels that only change shapes, and move no data.
 _VIEWS = {"Reshape", "Squeeze", "Unsqueeze", "Flatten", "Identity"}
@@ -153,7 +155,7 @@ def find_stages(graph: onnx.ModelProto) -> dict[str, str]:
         # A note lists the network, the nested modules and the operation.
         modules = ast.literal_eval(notes.get("pkg.torch.onnx.name_scopes", "['', '']"))[1:-1]
         inside = ".".join(modules[-1:])
-        if inside in ("", "refinement"):
+        if inside in ("", "refinement", "enlargement"):
             part = inside or last
             stage = _STAGES_BETWEEN.get((inside, last), _STAGES.get(part, part))
         else:
