@@ -1,13 +1,16 @@
 #!/usr/bin/env bash
-# Renders the sets of base_mix.toml and small.toml in runs/; resumes. First argument: number of processes.
+# Renders the sets of base_mix.toml and small.toml in runs/; resumes. First argument: number of processes; second:
+# seed of the scenes, 1701 if not given.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 make() { python3 -m stereoweave synth make "$@" --jobs "$jobs"; }
 jobs=${1:-$(nproc)}
+scenes_seed=${2:-1701}
+seed=$((scenes_seed + 2))
 
-make rooms --pairs 600 --seed 1703 -o runs/synth/rooms
-make street --pairs 150 --seed 1703 -o runs/synth/street
-make figures --pairs 200 --seed 1703 -o runs/synth/figures
+make rooms --pairs 600 --seed "$seed" -o runs/synth/rooms
+make street --pairs 150 --seed "$seed" -o runs/synth/street
+make figures --pairs 200 --seed "$seed" -o runs/synth/figures
 for scene in antenna bridge crane pylon refinery ship wind_turbine propeller; do
-    make "$scene" --pairs 16 --seed 1701 -o "runs/synth/scenes/$scene"
+    make "$scene" --pairs 16 --seed "$scenes_seed" -o "runs/synth/scenes/$scene"
 done
