@@ -45,7 +45,8 @@ Write = Annotated[
         metavar="NAME",
         help="Additional file to write: disparity.npy, disparity.tiff, disparity_scaled.png or "
         "matched_left.png; in metres, if the camera is known, depth.pfm, depth.npy, depth.tiff, cloud.ply, "
-        "cloud.glb, mesh.ply or mesh.glb; or all. Repeatable.",
+        "cloud.glb, mesh.ply or mesh.glb; report.html (always "
+        "written for a single pair); or all. Repeatable.",
     ),
 ]
 PicturesOrFolder = Annotated[
@@ -71,7 +72,11 @@ Listed = Annotated[
 ]
 Jobs = Annotated[
     int | None,
-    typer.Option(min=1, help="Number of pairs processed in parallel (default: all cores)."),
+    typer.Option(
+        min=1,
+        help="Number of pairs processed in parallel, with one thread each unless --threads is given "
+        "(default: all cores).",
+    ),
 ]
 Out = Annotated[
     Path | None,

@@ -92,8 +92,7 @@ Rectify = Annotated[
     typer.Option(
         "--rectify/--no-rectify",
         help="Rectify the pair by its calibration or, without one, by matched features (default: by matched "
-        "features, if corresponding points lie in different rows and neither a calibration nor focal length "
-        "or baseline is given).",
+        "features, if corresponding points lie in different rows and no camera is given).",
     ),
 ]
 Range = Annotated[
@@ -129,10 +128,10 @@ Strength = Annotated[
 Screen = Annotated[
     str | None,
     typer.Option(
-        help="Screen that will show a layout of several views: phone, television, headset or light_field. "
-        "Strength, at most 1, and convergence are chosen so that the depth fits it without strain, and black "
-        "bars cover what near objects lose at the left and right border; --strength and --convergence keep "
-        "the values given."
+        help="Screen that will show a layout (not rgbd, sweep, wiggle or viewer): phone, television, "
+        "headset or light_field. Strength, at most 1, and convergence are chosen so that the depth fits it "
+        "without strain, and black bars cover what near objects lose at the left and right border; "
+        "--strength and --convergence keep the values given."
     ),
 ]
 Model = Annotated[
