@@ -21,6 +21,9 @@ NOWHERE = Extent(confidence=0, reach_px=0, both_views=False, in_colour=False)
 EXTENTS = (
     NOWHERE,
     Extent(confidence=0.3, reach_px=1, both_views=True, in_colour=True),
+    Extent(confidence=0.3, reach_px=1, both_views=False, in_colour=False),
+    Extent(confidence=0.4, reach_px=1, both_views=False, in_colour=False),
+    Extent(confidence=0.3, reach_px=2, both_views=False, in_colour=False),
     Extent(confidence=0.3, reach_px=2, both_views=True, in_colour=True),
     Extent(confidence=0.4, reach_px=2, both_views=True, in_colour=True),
     Extent(confidence=0.4, reach_px=2, both_views=False, in_colour=True),
