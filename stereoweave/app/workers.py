@@ -84,9 +84,7 @@ class Workers:
     @contextmanager
     def _taking(self, visitor: str) -> Iterator[ChildProcess]:
         process = self._idle.pop() if self._idle else self._start()
-        if process.has_ended:
-            process.close()
-            process = self._start()
+        process.renew()
         self._busy[process] = visitor
         try:
             yield process

@@ -73,8 +73,8 @@ class ReplicaProcesses:
 
     @property
     def starting(self) -> bool:
-        """Whether the process that matches pictures is still starting."""
-        return self._answerer.starting
+        """Whether the process that matches pictures is still starting, or has ended and must be started."""
+        return self._answerer.starting or self._answerer.has_ended
 
     def measure(self, job: ServiceJob, left_s: float) -> float:
         """Return the size of a job's pictures in megapixels, read from their headers.
@@ -85,6 +85,7 @@ class ReplicaProcesses:
             TimeoutError: If this takes longer than `left_s`.
         """
         deadline_s = time.monotonic() + left_s
+        self._measurer.renew()
         self._measurer.wait_for_start(left_s)
         left_s = deadline_s - time.monotonic()
         try:
@@ -103,6 +104,7 @@ class ReplicaProcesses:
         If the jobs miss the earliest of their deadlines, or the process crashes, the process is replaced and
         the jobs are retried one by one. If it is still starting, they are not retried.
         """
+        self._answerer.renew()
         try:
             jobs = [timed.job for timed in timed_jobs]
             return self._answerer(jobs, min(timed.left_s for timed in timed_jobs))

@@ -92,8 +92,13 @@ class ChildProcess:
 
     @property
     def has_ended(self) -> bool:
-        """Whether the process was killed or crashed while no call was under way."""
+        """Whether the process exited while no call was under way, or `make` raised an error."""
         return self._process.poll() is not None
+
+    def renew(self) -> None:
+        """Start another process if this one has ended, so that the next call does not fail."""
+        if self.has_ended:
+            self._replace()
 
     def kill(self) -> None:
         """Kill the process. A call that is under way replaces it and raises ProcessDiedError."""
@@ -131,6 +136,8 @@ class ChildProcess:
                 "either a file in the request made it crash, or memory ran out"
             ) from None
         if error is not None:
+            if reply is self._started:  # without a function, the process is of no use
+                self._end()
             raise error
         return result
 

@@ -92,6 +92,30 @@ def test_a_crash_is_reported_in_one_line_and_the_other_jobs_are_answered(process
     assert "SIGSEGV" in str(outcomes[1])
 
 
+def test_no_job_is_blamed_for_processes_that_ended_while_they_were_idle(processes):
+    children = psutil.Process().children()
+    for child in children:
+        child.kill()
+        child.wait(10)
+    assert processes.starting
+    assert processes.measure(make_job().job, left_s=60) > 0
+    assert list_names(processes.answer([make_job("first")])) == ["first"]
+
+
+def load_from(file: Path) -> BatchAnswerer:
+    file.stat()
+    return load_named_answerer()
+
+
+def test_a_network_that_could_not_be_loaded_is_loaded_for_a_later_job(tmp_path):
+    processes = ReplicaProcesses(partial(load_from, tmp_path / "late"), tmp_path / "files")
+    with pytest.raises(FileNotFoundError):
+        processes.answer([make_job("first")])
+    (tmp_path / "late").touch()
+    assert list_names(processes.answer([make_job("second")])) == ["second"]
+    processes.close()
+
+
 def test_a_job_past_its_deadline_is_not_started(processes):
     assert list_names(processes.answer([make_job("first", within_s=-1)])) == ["TimeoutError"]
     assert list_names(processes.answer([make_job("second")])) == ["second"]

@@ -116,6 +116,22 @@ def test_an_error_in_making_the_function_is_raised_at_each_call(tmp_path):
     child.close()
 
 
+def _look_then_make(file: Path):
+    file.stat()
+    return abs
+
+
+def test_a_function_that_could_not_be_made_is_made_in_a_renewed_process(tmp_path):
+    child = ChildProcess(partial(_look_then_make, tmp_path / "late"), tmp_path / "files")
+    with pytest.raises(FileNotFoundError):
+        child(-7, timeout_s=10)
+    assert child.has_ended
+    (tmp_path / "late").touch()
+    child.renew()
+    assert child(-7, timeout_s=10) == 7
+    child.close()
+
+
 def test_the_output_of_a_function_is_not_part_of_its_result(tmp_path):
     child = child_of(partial(os.write, 1), tmp_path / "files")
     assert child(b"printed\n", timeout_s=10) == 8
@@ -188,7 +204,12 @@ def test_a_killed_process_ends_its_call_at_once_and_is_replaced(waiting):
     assert waiting(0, timeout_s=10) is None
 
 
-def test_a_process_that_is_killed_between_calls_has_ended(waiting):
+def test_a_process_that_is_killed_between_calls_has_ended_and_can_be_renewed(waiting):
     assert waiting(0, timeout_s=10) is None
+    first = waiting.pid
+    waiting.renew()
+    assert waiting.pid == first
     waiting.kill()
     assert waiting.has_ended
+    waiting.renew()
+    assert waiting(0, timeout_s=10) is None
