@@ -25,7 +25,10 @@ from stereoweave.system.threads import usable_cores
 Replicas = Annotated[int, typer.Option(min=1, help="Number of server processes; each loads the network.")]
 Address = Annotated[
     str | None,
-    typer.Option(help="Ray cluster to serve on, as host:port (default: start Ray on this machine)."),
+    typer.Option(
+        help="Ray cluster to serve on, as host:port, or local to start Ray on this machine (default: "
+        "RAY_ADDRESS if it is set, else local)."
+    ),
 ]
 Batch = Annotated[
     int | None,

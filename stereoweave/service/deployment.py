@@ -194,7 +194,8 @@ def run_service(settings: Settings, listener: socket.socket, address: str | None
         StereoweaveError: If the replicas do not fit, Ray cannot be reached, or the network does not load.
     """
     address = set_environment(address)
-    engine = Engine(address, cpus_each=settings.threads, gpus_each=settings.gpus_each)
+    # Without an address, an engine would join the cluster in RAY_ADDRESS.
+    engine = Engine(address or "local", cpus_each=settings.threads, gpus_each=settings.gpus_each)
     if address is None:
         _check_slots(settings, usable_cores() // settings.threads)
         # Report a network's errors before Ray starts, because starting Ray takes seconds.

@@ -58,14 +58,14 @@ def service(running) -> httpx.Client:
 @pytest.fixture(scope="module")
 def running(tmp_path_factory) -> Iterator[Running]:
     limits = ["--waiting", WAITING, "--max-megabytes", MEGABYTES, "--max-megapixels", 1, "--timeout-s", 20]
-    # local is the default, too.
     words = ["--address", "local", "--batch", 2, *limits]
-    with run_serve_command(tmp_path_factory.mktemp("uploads"), *words) as running:
+    # local must not join the cluster in RAY_ADDRESS; there is none at this one.
+    with run_serve_command(tmp_path_factory.mktemp("uploads"), *words, RAY_ADDRESS="127.0.0.1:9") as running:
         yield running
 
 
 @contextmanager
-def run_serve_command(uploads: Path, *words: object) -> Iterator[Running]:
+def run_serve_command(uploads: Path, *words: object, **environment: str) -> Iterator[Running]:
     """Run the command in another process, and check that it ends by itself and leaves no child process."""
     # Ray reports metrics every ten seconds by default. The paths of its sockets must be short.
     ray = {"RAY_metrics_report_interval_ms": "1000", "RAY_TMPDIR": "/tmp"}
@@ -73,7 +73,7 @@ def run_serve_command(uploads: Path, *words: object) -> Iterator[Running]:
         [sys.executable, *MEASURED_ALONE, "serve", "--port", "0", *map(str, words)],
         stdout=subprocess.PIPE,
         text=True,
-        env={**os.environ, **ray, "TMPDIR": str(uploads)},
+        env={**os.environ, **ray, **environment, "TMPDIR": str(uploads)},
     )
     try:
         with process.stdout:
