@@ -27,16 +27,18 @@ class BusyError(StereoweaveError):
 class Budget:
     """The work that one process has accepted, and the time that it takes per unit of work.
 
-    A request is refused permanently if it could not finish in time even at the best speed so far. It is
-    refused temporarily if, at the median of recent speeds, it would be late after all accepted requests.
+    A request is refused permanently if it could not finish within the time limit even at the best speed so
+    far. It is refused temporarily if too much of its time has passed, or if, at the median of recent speeds,
+    it would be late after all accepted requests.
 
     Args:
         seconds_each: Seconds per unit of work.
+        limit_s: Time limit of a request.
         refines: Whether the model always refines (`Matcher.refines`), so that the option adds no work.
     """
 
-    def __init__(self, seconds_each: float, *, refines: bool = False) -> None:
-        self._refines = refines
+    def __init__(self, seconds_each: float, limit_s: float, *, refines: bool = False) -> None:
+        self._limit_s, self._refines = limit_s, refines
         self._accepted: list[float] = []
         self._best_each_s = seconds_each
         self._latest_each_s = deque([seconds_each], _LATEST)
@@ -46,15 +48,21 @@ class Budget:
         """Accept a job, and count its work until the end of the block.
 
         Raises:
-            TooLargeError: If the job alone would take longer than `left_s`.
-            BusyError: If the job would take longer than `left_s` after all previously accepted jobs.
+            TooLargeError: If the job alone would take longer than the time limit.
+            BusyError: If the job would take longer than `left_s`, alone or after the accepted jobs.
         """
         work = self.estimate_work(job, megapixels)
         least_s = work * self._best_each_s
-        if least_s > left_s:
+        if least_s > self._limit_s:
             raise TooLargeError(
-                f"expected a request that takes at most {left_s:.0f} s, found {megapixels:.1f} megapixels "
-                f"that take {least_s:.0f} s with these options; send smaller pictures or use fewer options"
+                f"expected a request that takes at most {self._limit_s:.0f} s, found {megapixels:.1f} "
+                f"megapixels that take {least_s:.0f} s with these options; send smaller pictures or use "
+                "fewer options"
+            )
+        if least_s > left_s:
+            raise BusyError(
+                f"the request takes {least_s:.0f} s, and {left_s:.0f} s were left when it had arrived; "
+                "try again later"
             )
         late_s = (sum(self._accepted) + work) * median(self._latest_each_s) - left_s
         if self._accepted and late_s > 0:

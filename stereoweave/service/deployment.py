@@ -101,7 +101,9 @@ class Replica:
         self._folder = self._resources.enter_context(make_own_folder())
         self._processes = _make_processes(settings, self._folder)
         self._resources.callback(self._processes.close)
-        self._budget = Budget(self._processes.warm_up(), refines=settings.model in MODES)
+        self._budget = Budget(
+            self._processes.warm_up(), settings.limits.timeout_s, refines=settings.model in MODES
+        )
         # One thread per process: a call that waits for its thread has not been sent and can be cancelled.
         self._measuring_thread, self._answering_thread = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
         self._idle = asyncio.Event()
