@@ -122,7 +122,8 @@ class StereoPictureTab:
         session = self._sessions.find(key)
         viewing = format_paragraphs([KINDS[kind].viewing])
         if session is None:
-            return {self._viewing: format_paragraphs([GONE] if key else [KINDS[kind].viewing])}
+            # The tab is shown only with a result, so its session has expired; the key expires with it.
+            return {self._viewing: format_paragraphs([GONE]), **self.empty()}
         wish = Wish(
             kind=kind,
             longer_side_px=given[self._size],
@@ -139,7 +140,7 @@ class StereoPictureTab:
                 if self._sessions.keeps(key, session):
                     return {self._viewing: self._wording.format_error(error), **self.empty()}
             if not self._sessions.keeps(key, session):
-                return {self._viewing: format_paragraphs([GONE])}
+                return {self._viewing: format_paragraphs([GONE]), **self.empty()}
         made = session.stereo_pictures[wish]
         size_mb = made.file.stat().st_size / 1e6
         label = f"Download {made.file.name} ({size_mb:.1f} MB)"
