@@ -4,6 +4,7 @@ import logging
 import math
 import os
 import pickle
+import signal
 import socket
 import subprocess
 import sys
@@ -126,11 +127,23 @@ def connect(engine: Engine) -> Iterator[None]:
     if already:
         yield
         return
-    _join(address) if address else _start()
+    with _keep_sigterm_handler():
+        _join(address) if address else _start()
     try:
         yield
     finally:
         ray.shutdown()
+
+
+@contextmanager
+def _keep_sigterm_handler() -> Iterator[None]:
+    """Keep the program's own handler of SIGTERM, which `ray.init` replaces."""
+    handler = signal.getsignal(signal.SIGTERM)
+    try:
+        yield
+    finally:
+        if handler is not signal.getsignal(signal.SIGTERM) and handler not in (signal.SIG_DFL, None):
+            signal.signal(signal.SIGTERM, handler)
 
 
 def stream(

@@ -166,6 +166,17 @@ def test_a_function_is_called_on_each_machine_with_room_and_errors_are_left_out(
     assert call_on_each_machine(name_of_positive, 7, Engine(), timeout_s=0) == []
 
 
+def test_a_program_keeps_its_own_handler_of_sigterm(ray_address):
+    program = (
+        "import signal, sys; from stereoweave.system.ray_engine import Engine, connect\n"
+        "def stop(number, frame): print('stopped', number); sys.exit(7)\n"
+        "signal.signal(signal.SIGTERM, stop)\n"
+        "with connect(Engine(sys.argv[1])): signal.raise_signal(signal.SIGTERM)"
+    )
+    ended = subprocess.run([sys.executable, "-c", program, ray_address], capture_output=True, text=True)
+    assert (ended.returncode, ended.stdout) == (7, f"stopped {signal.SIGTERM:d}\n"), ended.stderr
+
+
 def test_a_wrong_address_is_reported_in_one_line(engine, monkeypatch):
     ray.shutdown()  # with an existing connection, the address would not be used
     monkeypatch.setattr(engine_module, "_STATUS_TIMEOUT_S", 1)
