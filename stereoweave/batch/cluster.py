@@ -15,6 +15,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
+from uuid import uuid4
 
 import typer
 from rich.console import Console
@@ -96,7 +97,8 @@ def run_cluster(
         plan = extend_plan(source_store, destination_store, min(workers, engine.workers or workers))
         for note in plan.notes:
             console.print(note, markup=False, highlight=False, soft_wrap=True)
-        worker = ChunkWorker(source_store, destination_store, job, tuple(_read_job_files(job)))
+        files = tuple(_read_job_files(job))
+        worker = ChunkWorker(source_store, destination_store, job, files, run=uuid4().hex)
         counts = _process_chunks(worker, plan, engine, console)
         _remove_abandoned_files(destination_store)
     return ClusterTally(

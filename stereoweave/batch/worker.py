@@ -84,12 +84,14 @@ class ChunkWorker:
         job: Settings for each pair.
         job_files: Kind (`model` or `calibration`), name and content of each job file that may exist only on
             the driver's machine.
+        run: Identifier of the run. Pairs that failed in another run are tried again.
     """
 
     source: Store
     destination: Store
     job: DepthJob
     job_files: tuple[tuple[str, str, bytes], ...] = ()
+    run: str = ""
 
     def __call__(self, chunks: Sequence[int]) -> Counts:
         """Process the unfinished pairs in several chunks, and return the counts of all pairs."""
@@ -131,8 +133,7 @@ class ChunkWorker:
 
     def _make_rows_in_child(self, missing: Sequence[PlanEntry], mark: str) -> list[ManifestRow]:
         """Process pairs in a child process, each with a limited number of attempts; return their rows."""
-        marked = self._read_mark(mark)
-        tries, rows = marked.get("tries", {}), {row["pair"]: row for row in marked.get("rows", [])}
+        tries, rows = self._read_attempts(mark)
         with _RowProcess(self) as child:
             for entry in missing:
                 if entry.name in rows and self._is_current(entry, rows[entry.name]):
@@ -141,11 +142,22 @@ class ChunkWorker:
                 while row is None and tries.get(entry.name, 0) < _MOST_TRIES:
                     child.start()
                     tries[entry.name] = tries.get(entry.name, 0) + 1
-                    marked = {"tries": tries, "rows": list(rows.values())}
+                    marked = {"run": self.run, "tries": tries, "rows": list(rows.values())}
                     self.destination.write_bytes(mark, json.dumps(marked).encode())
                     row = child.make_row(entry)
                 rows[entry.name] = row or self._make_empty_row(entry) | {"error": _KILLED_ERROR}
         return list(rows.values())
+
+    def _read_attempts(self, mark: str) -> tuple[dict[str, int], dict[str, ManifestRow]]:
+        """Return the number of attempts at each pair, and the rows, that killed workers have left in a mark.
+
+        Of another run, only the rows of pairs that did not fail.
+        """
+        marked = self._read_mark(mark)
+        rows = {row["pair"]: row for row in marked.get("rows", [])}
+        if marked.get("run", self.run) == self.run:
+            return marked.get("tries", {}), rows
+        return {}, {name: row for name, row in rows.items() if not row["error"]}
 
     def _read_mark(self, mark: str) -> dict[str, Any]:
         try:

@@ -207,6 +207,19 @@ def test_a_pair_that_kills_its_process_becomes_a_row_and_affects_no_other_pair(t
     assert not out.exists(f"begun/{first:08d}.json")
 
 
+def test_a_pair_whose_process_was_killed_is_tried_again_by_the_next_run(stores_and_chunk):
+    source, out, chunk = stores_and_chunk
+    entries, kept = read_chunk(out, chunk), {"disparity_median_px": 7.0}
+    ended = ChunkWorker(source, out, JOB, run="first")
+    rows = [ended.make_row(entries[0]) | kept, ended._make_empty_row(entries[1]) | {"error": "killed"}]
+    mark = {"run": "first", "tries": {entries[0].name: 1, entries[1].name: 3}, "rows": rows}
+    out.write_bytes(f"begun/{chunk:08d}.json", json.dumps(mark).encode())
+    assert ChunkWorker(source, out, JOB, run="second")([chunk]).made == 3
+    written = list(read_rows(out, chunk).values())
+    assert [row["error"] for row in written] == [None] * 3
+    assert written[0]["disparity_median_px"] == 7.0  # not made again
+
+
 class KilledAtStart(ChunkWorker):
     """A worker whose child processes are all killed while they start."""
 
