@@ -13,7 +13,6 @@ from PIL import Image
 from stereoweave.errors import StereoweaveError, require_extra
 from stereoweave.io.decoding import count_frames
 from stereoweave.io.files import replacing
-from stereoweave.io.images import checking_format_size
 
 Frames = Iterator[UInt8[np.ndarray, "h w 3"]]
 
@@ -34,11 +33,12 @@ def write_animation(path: str | Path, frames: Iterable[UInt8[np.ndarray, "h w 3"
         frame_ms: Duration of a frame. GIF rounds it to 10 ms.
 
     Raises:
-        StereoweaveError: The extension is not one of these, there are no frames, their sizes differ, PyAV is
-            missing, or the disk is full.
+        StereoweaveError: The extension is not one of these, there are no frames, their sizes differ or exceed
+            the format's, PyAV is missing, or the disk is full.
     """
-    write = _KINDS[check_animation_ending(path)]
-    alike = _check_sizes(frames)
+    ending = check_animation_ending(path)
+    write, most_px = _KINDS[ending]
+    alike = _check_sizes(frames, ending, most_px)
     with replacing(path) as temporary:
         return write(temporary, alike, frame_ms)
 
@@ -68,8 +68,8 @@ def require_video_extra(what: str) -> Iterator[None]:
         yield
 
 
-def _check_sizes(frames: Iterable[UInt8[np.ndarray, "h w 3"]]) -> Frames:
-    """Check the size of each frame against the first frame's size as the frames are rendered.
+def _check_sizes(frames: Iterable[UInt8[np.ndarray, "h w 3"]], ending: str, most_px: int) -> Frames:
+    """Check the first frame's size against the format's, and the others' against it as they are rendered.
 
     The first frame is rendered at once, so that its errors are raised before a file is created.
     """
@@ -77,6 +77,12 @@ def _check_sizes(frames: Iterable[UInt8[np.ndarray, "h w 3"]]) -> Frames:
     first = next(coming, None)
     if first is None:
         raise StereoweaveError("frames: expected at least one frame, found none")
+    height, width = first.shape[:2]
+    if max(height, width) > most_px:
+        raise StereoweaveError(
+            f"frames: expected at most {most_px} px per side for {ending}, found {width}x{height}; "
+            "make smaller frames"
+        )
     return chain([first], (_check_size(first, frame) for frame in coming))
 
 
@@ -136,13 +142,13 @@ def _write_webp(path: Path, frames: Frames, frame_ms: int) -> int:
 
 def _save(path: Path, kind: str, pictures: Iterator[Image.Image], frame_ms: int, **options: int) -> int:
     first = next(pictures)
-    with checking_format_size(path, (first.height, first.width)):
-        first.save(path, kind, save_all=True, append_images=pictures, duration=frame_ms, loop=0, **options)
+    first.save(path, kind, save_all=True, append_images=pictures, duration=frame_ms, loop=0, **options)
     return count_frames(path)
 
 
-_KINDS: dict[str, Callable[[Path, Frames, int], int]] = {
-    ".mp4": _write_mp4,
-    ".gif": _write_gif,
-    ".webp": _write_webp,
+# The function that writes each format, and the longest side that it can have.
+_KINDS: dict[str, tuple[Callable[[Path, Frames, int], int], int]] = {
+    ".mp4": (_write_mp4, 16384),
+    ".gif": (_write_gif, 65535),
+    ".webp": (_write_webp, 16383),
 }

@@ -132,10 +132,20 @@ def test_a_single_frame_is_enough_and_no_frame_is_an_error(tmp_path, moving, end
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_frames_of_two_sizes_are_refused_and_leave_no_file(tmp_path, moving, ending, without_shape_checks):
     with pytest.raises(
-        StereoweaveError, match="frames: expected frames of the same size, found 64x48 and 60x48"
+        StereoweaveError, match="^frames: expected frames of the same size, found 64x48 and 60x48"
     ):
         write_animation(tmp_path / f"a{ending}", [*moving, moving[0][:, :60]], 40)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("ending", "most_px"), [(".mp4", 16384), (".gif", 65535), (".webp", 16383)])
+def test_frames_that_are_too_large_for_the_format_are_refused(tmp_path, ending, most_px):
+    frames = np.zeros((2, 2, most_px + 1, 3), np.uint8)
+    message = f"^frames: expected at most {most_px} px per side for {ending}, found {most_px + 1}x2; make"
+    with pytest.raises(StereoweaveError, match=message):
+        write_animation(tmp_path / f"a{ending}", frames, 40)
+    assert list(tmp_path.iterdir()) == []
+    assert write_animation(tmp_path / f"a{ending}", frames[:, :, 1:], 40) >= 1
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
@@ -146,7 +156,7 @@ def test_an_error_halfway_keeps_the_earlier_file(tmp_path, moving, ending):
         yield from moving
         raise StereoweaveError("no more views")
 
-    with pytest.raises(StereoweaveError, match="no more views"):
+    with pytest.raises(StereoweaveError, match="^no more views"):
         write_animation(tmp_path / f"a{ending}", breaking(), 40)
     assert [file.read_text() for file in tmp_path.iterdir()] == ["kept"]
 
