@@ -16,6 +16,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -314,7 +315,8 @@ def _claim(out: Path, job: DepthJob) -> None:
 
 def _remove_abandoned_files(out: Path) -> None:
     """Remove temporary files left by killed processes; call this only while no process is writing."""
-    for folder in out.glob(".stereoweave-*"):
+    # A pair that is made again has its temporary files in its own folder.
+    for folder in chain(out.glob(".stereoweave-*"), out.glob("*/.stereoweave-*")):
         shutil.rmtree(folder, ignore_errors=True)
     remove_leftovers(out)
 

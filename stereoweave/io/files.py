@@ -125,4 +125,5 @@ def remove_leftovers(folder: Path) -> None:
     No other program may be writing to the folder.
     """
     for path in filter(is_leftover, folder.rglob(".*")):
-        path.unlink(missing_ok=True)
+        if not path.is_dir():
+            path.unlink(missing_ok=True)

@@ -247,6 +247,17 @@ def test_a_killed_or_interrupted_batch_resumes_but_not_while_another_one_runs(tm
     assert not list(out.rglob(".*"))
 
 
+def test_files_left_by_killed_processes_are_removed_by_the_next_run(tmp_path):
+    pairs, out = find_pairs_in(write_pairs(tmp_path / "pairs", 1)), tmp_path / "out"
+    assert run_batch_command(pairs, out, JOB, processes=1) == 0
+    # The last name looks like that of a temporary file.
+    for folder in (out / ".stereoweave-x1", out / "00/.stereoweave-x2", out / "00/.stereoweave-0123abcd"):
+        folder.mkdir()
+        (folder / "cloud.ply").touch()
+    assert run_batch_command(pairs, out, JOB, processes=1) == 0
+    assert not list(out.rglob(".*"))
+
+
 def test_pairs_with_warnings_are_counted_and_the_table_has_the_warnings(tmp_path, capsys):
     folder, out = write_pairs(tmp_path / "pairs", 8), tmp_path / "out"
     for name in [f"{index:02d}.png" for index in range(1, 7)]:
