@@ -3,6 +3,7 @@
 import re
 from collections.abc import Sequence
 from functools import lru_cache
+from itertools import chain, zip_longest
 from posixpath import splitext
 
 _SIDES = {"left": "right", "Left": "Right", "LEFT": "RIGHT", "l": "r", "L": "R", "im0": "im1"}
@@ -31,11 +32,17 @@ def pair_by_marks(paths: Sequence[str]) -> list[tuple[str, str]]:
     return next(filter(None, (_pair_by_mark(mark, paths) for mark in _MARKS)), [])
 
 
-def strip_marks(path: str) -> list[str]:
-    """Return the parts of a path without their marks and without the file extension."""
+def strip_marks(path: str, partner: str | None = None) -> list[str]:
+    """Return the parts of a path without the file extension and its marks.
+
+    Marks that the other picture has, too, stay: right_wing_L and right_wing_R are right_wing.
+    """
     parts = splitext(path)[0].split("/")
     mark = next((mark for mark in _MARKS if any(map(mark.search, parts))), _MARKS[-1])
-    return [_strip_marks(mark, part) for part in parts]
+    others = splitext(partner)[0].split("/") if partner else []
+    if len(others) != len(parts):
+        return [_strip_marks(mark, part) for part in parts]
+    return [_strip_unlike_marks(mark, *both) for both in zip(parts, others, strict=True)]
 
 
 def _pair_by_mark(mark: re.Pattern[str], paths: Sequence[str]) -> list[tuple[str, str]]:
@@ -46,7 +53,7 @@ def _pair_by_mark(mark: re.Pattern[str], paths: Sequence[str]) -> list[tuple[str
         if path not in settled and (marked := _swap_sides(mark, stem)):
             others, is_left = marked
             found = (other + ending if other + ending in there else by_stem.get(other) for other in others)
-            partner = next(filter(None, found), others[0] + ending)
+            partner = next(filter(None, found), others[-1] + ending)
             pairs.add((path, partner) if is_left else (partner, path))
             if partner == others[0] + ending:  # the partner's own first choice is this path
                 settled.add(partner)
@@ -54,10 +61,10 @@ def _pair_by_mark(mark: re.Pattern[str], paths: Sequence[str]) -> list[tuple[str
 
 
 def _swap_sides(mark: re.Pattern[str], stem: str) -> tuple[list[str], bool] | None:
-    """Return the other picture's possible paths, and whether this picture is the left one.
+    """Return the other picture's possible paths, likeliest first, and whether this one is the left one.
 
-    All paths lack the file extension. The other path has all marks swapped, or only the last mark. Return
-    None if the path has no marks.
+    All paths lack the file extension. The other path has only the last mark swapped, all marks of the last
+    part that has any, or all marks. Return None if the path has no marks.
     """
     parts = stem.split("/")
     swapped = [_swap_marks(mark, part) for part in parts]
@@ -65,10 +72,10 @@ def _swap_sides(mark: re.Pattern[str], stem: str) -> tuple[list[str], bool] | No
     if not places:
         return None
     last = places[-1]
-    others = ["/".join(swapped)]
-    if len(places) > 1:
-        others.append("/".join((*parts[:last], *swapped[last:])))
-    return others, mark.findall(parts[last])[-1] in _SIDES
+    *_, found = mark.finditer(parts[last])
+    nearest = parts[last][: found.start()] + _OTHER_SIDES[found[0]] + parts[last][found.end() :]
+    others = ["/".join((*parts[:last], part, *parts[last + 1 :])) for part in (nearest, swapped[last])]
+    return [*others, "/".join(swapped)], found[0] in _SIDES
 
 
 # Cached, because most pictures are in the same folder as the previous one.
@@ -80,3 +87,13 @@ def _swap_marks(mark: re.Pattern[str], part: str) -> str:
 @lru_cache(maxsize=1000)
 def _strip_marks(mark: re.Pattern[str], part: str) -> str:
     return "_".join(filter(None, (piece.strip(" _.-") for piece in mark.split(part))))
+
+
+def _strip_unlike_marks(mark: re.Pattern[str], part: str, other: str) -> str:
+    """Return a part without the marks that differ from those of the other path's part."""
+    own, others = mark.findall(part), mark.findall(other)
+    if len(own) != len(others):
+        return _strip_marks(mark, part)
+    kept = ["/" if mine != other_mark else mine for mine, other_mark in zip(own, others, strict=True)]
+    text = "".join(chain.from_iterable(zip_longest(mark.split(part), kept, fillvalue="")))
+    return "_".join(filter(None, (piece.strip(" _.-") for piece in text.split("/"))))

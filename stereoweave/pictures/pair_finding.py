@@ -189,11 +189,11 @@ def find_pairs_among(folder: str | Path, paths: Iterable[str]) -> Listed:
     if not (halves or doubles):
         doubles, rest = rest, []
     whole, calibrations = _absolute(folder).name, set(files[_CALIBRATION])
-    pairs = [ListedPair(_name_pair(path, 1, whole), (path,)) for path in sorted(doubles)]
+    pairs = [ListedPair(_name_pair((path,), whole), (path,)) for path in sorted(doubles)]
     for left, right in halves:
         beside = f"{left[: left.rfind('/') + 1]}{_CALIBRATION}"
         calibration = beside if beside in calibrations and _owns_calibration(left, 2) else None
-        pairs.append(ListedPair(_name_pair(left, 2, whole), (left, right), calibration))
+        pairs.append(ListedPair(_name_pair((left, right), whole), (left, right), calibration))
     films = [ListedPair(_sanitize(path), (path,)) for path in sorted(files["film"])]
     _check_names((pair.name, pair.files) for pair in chain(pairs, films))
     return Listed(pairs, films, rest)
@@ -268,7 +268,7 @@ def find_root(pattern: str) -> Path:
 
 def _name_globbed(pattern: str, found: Sequence[Path]) -> list[str]:
     root = _absolute(find_root(pattern))
-    return [_name_pair(_path_below(root, path), 2, "") for path in found]
+    return [_join_parts(strip_marks(_path_below(root, path))) for path in found]
 
 
 def read_pair_list(path: Path) -> list[NamedPair]:
@@ -392,11 +392,11 @@ def _make_pairs(
     above = _absolute(root)
     pairs = []
     for paths, given in zip(pictures, names, strict=False):
-        below = _path_below(above, paths[0])
-        name = _sanitize(given) if given else _name_pair(below, len(paths), above.name)
+        below = [_path_below(above, path) for path in paths]
+        name = _sanitize(given) if given else _name_pair(below, above.name)
         beside = paths[0].parent / _CALIBRATION
         # Not Path.exists, which raises an error if a name is too long.
-        is_own = _owns_calibration(below, len(paths)) and os.path.exists(beside)  # noqa: PTH110
+        is_own = _owns_calibration(below[0], len(paths)) and os.path.exists(beside)  # noqa: PTH110
         pairs.append(NamedPair(name, paths, beside if is_own else None))
     _check_names((pair.name, pair.pictures) for pair in pairs)
     return pairs
@@ -429,10 +429,13 @@ def _check_names(names: Iterable[tuple[str, Sequence[str | Path]]]) -> None:
             )
 
 
-def _name_pair(path: str, pictures: int, whole: str) -> str:
+def _name_pair(paths: Sequence[str], whole: str) -> str:
     """Name a pair after its first picture's path without marks, or after the folder if nothing remains."""
-    parts = strip_marks(path) if pictures == 2 else splitext(path)[0].split("/")
-    return _sanitize("_".join(filter(None, parts)) or whole)
+    return _join_parts(strip_marks(*paths) if len(paths) == 2 else splitext(paths[0])[0].split("/"), whole)
+
+
+def _join_parts(parts: Iterable[str], otherwise: str = "") -> str:
+    return _sanitize("_".join(filter(None, parts)) or otherwise)
 
 
 def _sanitize(name: str) -> str:

@@ -51,7 +51,11 @@ def listed(folder: Path, pairs: list[NamedPair]) -> dict[str, tuple[str, ...]]:
         ("castle_0001", "castle/Left/0001.png", "castle/Right/0001.png"),
         ("Img8bit_a_1_Img8bit", "leftImg8bit/a_1_leftImg8bit.png", "rightImg8bit/a_1_rightImg8bit.png"),
         ("img_7", "imgLeft/img_7.tif", "imgRight/img_7.tif"),
-        ("to", "left_to_right/left.png", "left_to_right/right.png"),
+        ("left_to_right", "left_to_right/left.png", "left_to_right/right.png"),
+        ("right_wing", "right_wing_L.jpg", "right_wing_R.jpg"),
+        ("left_turn_01", "left_turn_01_L.png", "left_turn_01_R.png"),
+        ("left_cam", "left_cam_l.png", "left_cam_r.png"),
+        ("turn", "left_turn_L.png", "right_turn_R.png"),
     ],
 )
 def test_a_folders_pairs_are_found_by_the_marks_of_their_sides(tmp_path, name, left, right):
@@ -76,6 +80,13 @@ def test_a_pair_right_in_the_folder_has_the_folders_name(tmp_path):
 def test_cameras_that_have_two_eyes_each_are_two_rigs(tmp_path, pairs):
     folder = put(tmp_path, *(path for pair in pairs.values() for path in pair))
     assert listed(folder, find_pairs_in(folder).pairs) == pairs
+
+
+def test_pairs_whose_other_marks_are_alike_keep_these_in_their_names(tmp_path):
+    pairs = {f"{side}_wing": (f"{side}_wing_L.jpg", f"{side}_wing_R.jpg") for side in ("left", "right")}
+    pairs |= {"left_a": ("left/a_L.png", "left/a_R.png"), "right_a": ("right/a_L.png", "right/a_R.png")}
+    folder = put(tmp_path, "b_L.jpg", "b_R.jpg", *(path for pair in pairs.values() for path in pair))
+    assert listed(folder, find_pairs_in(folder).pairs) == pairs | {"b": ("b_L.jpg", "b_R.jpg")}
 
 
 def test_numbers_of_cameras_mean_nothing_beside_pairs_of_left_and_right(tmp_path):
