@@ -3,7 +3,7 @@
 import re
 from collections.abc import Sequence
 from functools import lru_cache
-from itertools import chain, zip_longest
+from itertools import chain, takewhile, zip_longest
 from posixpath import splitext
 
 _SIDES = {"left": "right", "Left": "Right", "LEFT": "RIGHT", "l": "r", "L": "R", "im0": "im1"}
@@ -38,26 +38,43 @@ def strip_marks(path: str, partner: str | None = None) -> list[str]:
     Marks that the other picture has, too, stay: right_wing_L and right_wing_R are right_wing.
     """
     parts = splitext(path)[0].split("/")
-    mark = next((mark for mark in _MARKS if any(map(mark.search, parts))), _MARKS[-1])
     others = splitext(partner)[0].split("/") if partner else []
     if len(others) != len(parts):
+        mark = next((mark for mark in _MARKS if any(map(mark.search, parts))), _MARKS[-1])
         return [_strip_marks(mark, part) for part in parts]
+    unlike = (mark for mark in _MARKS if [*map(mark.findall, parts)] != [*map(mark.findall, others)])
+    mark = next(unlike, _MARKS[-1])
     return [_strip_unlike_marks(mark, *both) for both in zip(parts, others, strict=True)]
 
 
 def _pair_by_mark(mark: re.Pattern[str], paths: Sequence[str]) -> list[tuple[str, str]]:
     there, pairs, settled = set(paths), set(), set()
     by_stem = {splitext(path)[0]: path for path in paths}
+
+    def find(others: Sequence[str], ending: str) -> str | None:
+        found = (other + ending if other + ending in there else by_stem.get(other) for other in others)
+        return next(filter(None, found), None)
+
     for path in paths:
         stem, ending = splitext(path)
-        if path not in settled and (marked := _swap_sides(mark, stem)):
-            others, is_left = marked
-            found = (other + ending if other + ending in there else by_stem.get(other) for other in others)
-            partner = next(filter(None, found), others[-1] + ending)
-            pairs.add((path, partner) if is_left else (partner, path))
-            if partner == others[0] + ending:  # the partner's own first choice is this path
-                settled.add(partner)
+        if path in settled or not (marked := _swap_sides(mark, stem)):
+            continue
+        others, is_left = marked
+        partner = find(others, ending)
+        if partner is None:
+            partner = others[-1] + ending
+        elif by_stem.keys().isdisjoint(_list_nearer(mark, partner, stem)):
+            settled.add(partner)
+        else:  # the partner belongs to a nearer path, so this path's own partner is missing
+            partner = others[0] + ending
+        pairs.add((path, partner) if is_left else (partner, path))
     return sorted(pairs) if any(there.issuperset(pair) for pair in pairs) else []
+
+
+def _list_nearer(mark: re.Pattern[str], path: str, stem: str) -> list[str]:
+    """Return the possible partners of a path that are likelier than the one with this stem."""
+    others, _ = _swap_sides(mark, splitext(path)[0]) or ([], False)
+    return list(takewhile(lambda other: other != stem, others))
 
 
 def _swap_sides(mark: re.Pattern[str], stem: str) -> tuple[list[str], bool] | None:

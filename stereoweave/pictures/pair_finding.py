@@ -245,9 +245,13 @@ def find_pairs_by_globs(left: str, right: str) -> list[NamedPair]:
             f"expected as many left pictures as right pictures, found {len(lefts)} for {left} and "
             f"{len(rights)} for {right}"
         )
-    by_name = dict(zip(_name_globbed(right, rights), rights, strict=True))
-    partners = [by_name.get(name) for name in _name_globbed(left, lefts)]
-    if not any(partners):
+    left_names, right_names = _name_globbed(left, lefts), _name_globbed(right, rights)
+    by_name = dict(zip(right_names, rights, strict=True))
+    partners = [by_name.get(name) for name in left_names]
+    if any(partners):
+        for names, found in ((left_names, lefts), (right_names, rights)):
+            _check_names((name, (path,)) for name, path in zip(names, found, strict=True))
+    else:
         partners = [*rights]
     pairs = []
     for path, partner in zip(lefts, partners, strict=True):

@@ -54,6 +54,8 @@ def listed(folder: Path, pairs: list[NamedPair]) -> dict[str, tuple[str, ...]]:
         ("left_to_right", "left_to_right/left.png", "left_to_right/right.png"),
         ("right_wing", "right_wing_L.jpg", "right_wing_R.jpg"),
         ("left_turn_01", "left_turn_01_L.png", "left_turn_01_R.png"),
+        ("right_wing_01", "right_wing_L_01.png", "right_wing_R_01.png"),
+        ("left_turn_1", "left_turn/cam0/1.png", "left_turn/cam1/1.png"),
         ("left_cam", "left_cam_l.png", "left_cam_r.png"),
         ("turn", "left_turn_L.png", "right_turn_R.png"),
     ],
@@ -87,6 +89,26 @@ def test_pairs_whose_other_marks_are_alike_keep_these_in_their_names(tmp_path):
     pairs |= {"left_a": ("left/a_L.png", "left/a_R.png"), "right_a": ("right/a_L.png", "right/a_R.png")}
     folder = put(tmp_path, "b_L.jpg", "b_R.jpg", *(path for pair in pairs.values() for path in pair))
     assert listed(folder, find_pairs_in(folder).pairs) == pairs | {"b": ("b_L.jpg", "b_R.jpg")}
+
+
+@pytest.mark.parametrize(
+    ("files", "missing"),
+    [
+        (("left_wing_L.jpg", "right_wing_L.jpg", "right_wing_R.jpg"), "left_wing_R.jpg"),
+        (("left/a_L.png", "right/a_L.png", "right/a_R.png"), "left/a_R.png"),
+        (("a_left_L.png", "a_left_R.png", "a_right_R.png"), "a_right_L.png"),
+    ],
+)
+def test_a_picture_of_a_pair_is_not_the_missing_one_of_another_pair(tmp_path, files, missing):
+    folder = put(tmp_path, *files)
+    pictures = [path for pair in listed(folder, find_pairs_in(folder).pairs).values() for path in pair]
+    assert sorted(pictures) == sorted([*files, missing])
+
+
+def test_globs_whose_names_without_marks_are_alike_are_refused(tmp_path):
+    folder = put(tmp_path, *(f"{side}_wing_{eye}.jpg" for side in ("left", "right") for eye in "LR"))
+    with pytest.raises(StereoweaveError, match="found wing for both .*left_wing_L.jpg and .*right_wing_L"):
+        find_pairs_by_globs(f"{folder}/*_L.jpg", f"{folder}/*_R.jpg")
 
 
 def test_numbers_of_cameras_mean_nothing_beside_pairs_of_left_and_right(tmp_path):
