@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from stereoweave.errors import StereoweaveError, require_extra
+from stereoweave.errors import Remedy, StereoweaveError, require_extra
 from stereoweave.io.decoding import count_frames
 from stereoweave.io.files import replacing
 
@@ -36,9 +36,8 @@ def write_animation(path: str | Path, frames: Iterable[UInt8[np.ndarray, "h w 3"
         StereoweaveError: The extension is not one of these, there are no frames, their sizes differ or exceed
             the format's, PyAV is missing, or the disk is full.
     """
-    ending = check_animation_ending(path)
-    write, most_px = _KINDS[ending]
-    alike = _check_sizes(frames, ending, most_px)
+    write, most_px = _KINDS[check_animation_ending(path)]
+    alike = _check_sizes(path, frames, most_px)
     with replacing(path) as temporary:
         return write(temporary, alike, frame_ms)
 
@@ -68,7 +67,7 @@ def require_video_extra(what: str) -> Iterator[None]:
         yield
 
 
-def _check_sizes(frames: Iterable[UInt8[np.ndarray, "h w 3"]], ending: str, most_px: int) -> Frames:
+def _check_sizes(path: str | Path, frames: Iterable[UInt8[np.ndarray, "h w 3"]], most_px: int) -> Frames:
     """Check the first frame's size against the format's, and the others' against it as they are rendered.
 
     The first frame is rendered at once, so that its errors are raised before a file is created.
@@ -80,8 +79,8 @@ def _check_sizes(frames: Iterable[UInt8[np.ndarray, "h w 3"]], ending: str, most
     height, width = first.shape[:2]
     if max(height, width) > most_px:
         raise StereoweaveError(
-            f"frames: expected at most {most_px} px per side for {ending}, found {width}x{height}; "
-            "make smaller frames"
+            f"{path}: expected frames of at most {most_px} px per side, found {width}x{height}",
+            remedy=Remedy("limit their size", ("size_px",)),
         )
     return chain([first], (_check_size(first, frame) for frame in coming))
 
