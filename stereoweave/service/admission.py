@@ -17,7 +17,7 @@ _LATEST = 9
 
 
 class BusyError(StereoweaveError):
-    """Error for a request that would be late only because of previously accepted requests."""
+    """Error for a request that would be late, but need not be if it is sent again."""
 
     def __init__(self, message: str, retry_after_s: int = 1) -> None:
         super().__init__(message)
@@ -61,8 +61,8 @@ class Budget:
             )
         if least_s > left_s:
             raise BusyError(
-                f"the request takes {least_s:.0f} s, and {left_s:.0f} s were left when it had arrived; "
-                "try again later"
+                f"expected more than {least_s:.1f} s for this request, found {left_s:.1f} s left; try again, "
+                "send smaller pictures or use fewer options"
             )
         late_s = (sum(self._accepted) + work) * median(self._latest_each_s) - left_s
         if self._accepted and late_s > 0:
