@@ -92,14 +92,17 @@ def test_a_crash_is_reported_in_one_line_and_the_other_jobs_are_answered(process
     assert "SIGSEGV" in str(outcomes[1])
 
 
-def test_no_job_is_blamed_for_processes_that_ended_while_they_were_idle(processes):
-    children = psutil.Process().children()
-    for child in children:
+def test_no_job_is_blamed_for_processes_that_ended_while_they_were_idle(tmp_path):
+    others = set(psutil.Process().children())
+    processes = ReplicaProcesses(load_named_answerer, tmp_path / "files")
+    processes.answer([make_job()])
+    for child in set(psutil.Process().children()) - others:
         child.kill()
         child.wait(10)
     assert processes.starting
     assert processes.measure(make_job().job, left_s=60) > 0
     assert list_names(processes.answer([make_job("first")])) == ["first"]
+    processes.close()
 
 
 def load_from(file: Path) -> BatchAnswerer:
