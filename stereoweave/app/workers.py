@@ -84,9 +84,9 @@ class Workers:
     @contextmanager
     def _taking(self, visitor: str) -> Iterator[ChildProcess]:
         process = self._idle.pop() if self._idle else self._start()
-        process.renew()
         self._busy[process] = visitor
         try:
+            process.renew()
             yield process
         finally:
             del self._busy[process]
