@@ -40,7 +40,7 @@ def stopping_orderly() -> Iterator[None]:
         raise
     finally:
         for number in handled:
-            if signal.getsignal(number) is stop:  # Ray installs its own handlers
+            if signal.getsignal(number) is stop:  # the block may have installed its own
                 signal.signal(number, signal.SIG_DFL)
 
 
