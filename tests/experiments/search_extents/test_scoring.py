@@ -27,8 +27,11 @@ def rows(folder):
 def test_there_is_a_row_for_each_extent_and_a_wider_one_searches_more(rows):
     assert [(row.confidence, row.reach_px, row.both_views, row.in_colour) for row in rows] == list(EXTENTS)
     assert {(row.folder, row.pairs) for row in rows} == {("pairs", 1)}
-    nowhere, least, wider, wide, *_, widest = (row.searched_percent for row in rows)
-    assert nowhere == 0 < least < wider < wide < widest
+    assert rows[EXTENTS.index(NOWHERE)].searched_percent == 0
+    searched = {(row.confidence, row.reach_px): row.searched_percent for row in rows}
+    for (confidence, reach_px), percent in searched.items():
+        wider = [each for each in searched if each[0] >= confidence and each[1] >= reach_px]
+        assert all(searched[each] > percent for each in wider if each != (confidence, reach_px))
 
 
 def test_a_search_lowers_the_errors_of_a_real_pair(rows):
