@@ -8,6 +8,7 @@ until then the changed kernel is compiled by Numba at its first use.
 import json
 import lzma
 import os
+import re
 import sys
 import tempfile
 import warnings
@@ -79,7 +80,7 @@ def make_bitcode(assembly: str) -> bytes:
     Raises:
         ValueError: The code refers to objects of this process, or to functions that users' processes lack.
     """
-    module = llvm.parse_assembly(assembly)
+    module = llvm.parse_assembly(_annotate_arguments(assembly))
     for function in module.functions:
         # Visible from outside are only the kernel, and its entry point for Python, which stays unused.
         is_visible = function.linkage == llvm.Linkage.external and not function.is_declaration
@@ -96,6 +97,22 @@ def make_bitcode(assembly: str) -> bytes:
     if outside:
         raise ValueError(f"expected code that stands alone, found references to {', '.join(outside)}")
     return module.as_bitcode()
+
+
+def _annotate_arguments(assembly: str) -> str:
+    """Return the code of a kernel with what Numba does not know of the arrays that it is given.
+
+    They have no owner that counts references to them (`shipped_kernels.flatten`), and do not overlap
+    (`jit.Kernel`).
+    """
+
+    def annotate(kernel: re.Match[str]) -> str:
+        head, body = kernel.groups()
+        for owner in re.findall(r"ptr (%arg\.[\w.]+\.0)[,)]", head):
+            body = re.sub(re.escape(owner) + r"(?![\w.])", "null", body)
+        return re.sub(r"ptr (?=%arg\.[\w.]+\.4[,)])", "ptr noalias ", head) + body
+
+    return re.sub(r"^(define i32 @.*\n)((?:.*\n)*?}\n)", annotate, assembly, count=1, flags=re.MULTILINE)
 
 
 def _simplify(module: Any) -> None:

@@ -50,6 +50,8 @@ class Kernel:
     Code that any process of this user has compiled for this machine is loaded. Otherwise the kernel that
     ships with the package is compiled by LLVM. If there is none for this machine, for these arguments or
     for the present sources, the function is compiled by Numba, which takes longer.
+
+    An array that the kernel writes to must not overlap another of its arrays: the shipped code relies on it.
     """
 
     def __init__(self, function: Callable[..., None]) -> None:

@@ -1,5 +1,6 @@
 import json
 import lzma
+import re
 import subprocess
 import sys
 import threading
@@ -9,12 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from llvmlite import binding
 
 from stereoweave.matching.refine_kernels import census
 from stereoweave.system import kernel_cache, shipped_kernels, threads
 from stereoweave.system.jit import Kernel
 from stereoweave.system.kernel_cache import kernels_folder
-from stereoweave.system.shipped_kernels import FOLDER, INDEX, bitcode_platform, flatten, sources_digest
+from stereoweave.system.shipped_kernels import ENTRY, FOLDER, INDEX, bitcode_platform, flatten, sources_digest
 
 PACKAGE = Path(shipped_kernels.__file__).parents[1]
 INDEXED = json.loads((FOLDER / INDEX).read_bytes())
@@ -145,6 +147,18 @@ def test_shipped_code_knows_no_processor():
     code = b"".join(lzma.decompress(file.read_bytes()) for file in FOLDER.glob("*.xz"))
     assert b"llvm.x86" not in code
     assert b"target-cpu" not in code
+
+
+@shipped_here
+def test_kernels_count_no_references_to_the_arrays_they_are_given_which_do_not_overlap():
+    for file in FOLDER.glob("*.xz"):
+        code = str(binding.parse_bitcode(lzma.decompress(file.read_bytes())))
+        (kernel,) = re.findall(rf"^define .*@{ENTRY}\((?:.*\n)*?}}$", code, re.MULTILINE)
+        head, *body = kernel.splitlines()
+        addresses = re.findall(r"ptr ([^%]*)%arg\.[\w.]+\.4[,)]", head)
+        assert addresses, file.name
+        assert all("noalias" in address for address in addresses), file.name
+        assert not [line for line in body if re.search(r"@NRT_.*%arg", line)], file.name
 
 
 def interrupt_at_line(number, files):
