@@ -36,10 +36,10 @@ LARGEST_MOVE_PX = 24
 """Border disparities that differ from the surface's by more than this belong to another surface."""
 _CENSUS_RADIUS = 2
 _COLOURS = 3
-_NEVER, _HIGHEST = np.uint16(30000), np.uint16(65535)
+_NOTHING, _NEVER, _HIGHEST = np.uint16(0), np.uint16(30000), np.uint16(65535)
 _SIX = np.uint16(6)
 # Numba widens sums to 64 bits unless both operands are narrow; wide sums would halve the vectors' length.
-_ONE, _TWO, _FOUR, _HALF, _TOP = (np.uint32(bits) for bits in (1, 2, 4, 16, 24))
+_ONE, _TWO, _FOUR, _HALF, _TOP, _WORD = (np.uint32(bits) for bits in (1, 2, 4, 16, 24, 32))
 _LOW, _LARGEST = np.uint32(0xFFFF), np.uint32(0xFFFFFFFF)
 _PAIRS, _FOURS, _EIGHTS, _SUM = (np.uint32(mask) for mask in (0x55555555, 0x33333333, 0x0F0F0F0F, 0x01010101))
 
@@ -107,7 +107,10 @@ def bits(code):
     """Return the number of set bits in a 32-bit code."""
     pairs = np.uint32(code - ((code >> _ONE) & _PAIRS))
     fours = np.uint32((pairs & _FOURS) + ((pairs >> _TWO) & _FOURS))
-    return np.int32(np.uint32(((fours + (fours >> _FOUR)) & _EIGHTS) * _SUM) >> _TOP)
+    count = np.uint32(np.uint32(((fours + (fours >> _FOUR)) & _EIGHTS) * _SUM) >> _TOP)
+    # Without this limit, LLVM joins the shift with what the caller does, and no longer recognises a count of
+    # bits, for which recent processors have an instruction.
+    return np.int32(min(count, _WORD))
 
 
 @inlined
@@ -127,26 +130,11 @@ def _difference(level, dark, bright, there, dark_there, bright_there):
 
 @inlined
 @typing.no_type_check
-def _add_differences(level, dark, bright, levels, darks, brights, costs):
-    """Add a channel's difference to each candidate's cost."""
+def _add_differences(level, dark, bright, levels, darks, brights, kept, costs):
+    """Add a channel's difference to the bits `kept` of each candidate's cost."""
     for i in range(costs.shape[0]):
-        costs[i] = np.uint8(costs[i] + _difference(level, dark, bright, levels[i], darks[i], brights[i]))
-
-
-@inlined
-@typing.no_type_check
-def _weigh(weight, costs):
-    """Multiply each candidate's cost by half the weight."""
-    for i in range(costs.shape[0]):
-        costs[i] = np.uint8(np.uint8(costs[i] * weight) >> np.uint8(1))
-
-
-@inlined
-@typing.no_type_check
-def _add_census(code, codes, costs):
-    """Add twice the Hamming distance between the census codes to each candidate's cost."""
-    for i in range(costs.shape[0]):
-        costs[i] = np.uint8(costs[i] + 2 * bits(code ^ codes[i]))
+        difference = _difference(level, dark, bright, levels[i], darks[i], brights[i])
+        costs[i] = np.uint8(np.uint8(costs[i] & kept) + difference)
 
 
 @inlined
@@ -163,12 +151,17 @@ def _pull(prior, trust, candidate):
 
 @inlined
 @typing.no_type_check
-def _add_pulls(prior, trust, priors, trusts, first, costs):
-    """Add the cost of each candidate's distance to the network's disparities in both views."""
+def _add_rest(weight, code, prior, trust, codes, priors, trusts, first, costs):
+    """Multiply each candidate's cost by half the weight, and add what does not depend on colours.
+
+    This is twice the Hamming distance between the census codes, and the cost of the candidate's distance to
+    the network's disparities in both views.
+    """
     for i in range(costs.shape[0]):
+        difference = np.uint8(np.uint8(costs[i] * weight) >> np.uint8(1))
         candidate = np.uint16(SUBSTEPS * (first + i))
         pulls = _pull(prior, trust, candidate) + _pull(priors[i], trusts[i], candidate)
-        costs[i] = np.uint8(costs[i] + pulls)
+        costs[i] = np.uint8(difference + 2 * bits(code ^ codes[i]) + pulls)
 
 
 @kernel
@@ -218,7 +211,6 @@ def match(own, other, search, towards, levels, first, last, costs):
             start = skipped + (x if towards > 0 else width - 1 - x)
             end = start + count
             out = costs[place : place + count]
-            out[:] = 0
             for i in range(channels):
                 _add_differences(
                     own.levels[y, i, x],
@@ -227,12 +219,20 @@ def match(own, other, search, towards, levels, first, last, costs):
                     other.levels[y, i, start:end],
                     other.darkest[y, i, start:end],
                     other.brightest[y, i, start:end],
+                    np.uint8(255 if i else 0),
                     out,
                 )
-            _weigh(weight, out)
-            _add_census(own.census[y, x], other.census[y, start:end], out)
-            priors, trusts = other.prior[y, start:end], other.trust[y, start:end]
-            _add_pulls(own.prior[y, x], own.trust[y, x], priors, trusts, skipped, out)
+            _add_rest(
+                weight,
+                own.census[y, x],
+                own.prior[y, x],
+                own.trust[y, x],
+                other.census[y, start:end],
+                other.prior[y, start:end],
+                other.trust[y, start:end],
+                skipped,
+                out,
+            )
 
 
 @inlined
@@ -255,8 +255,11 @@ def _close(path, first):
 
 @inlined
 @typing.no_type_check
-def _step(before, least, costs, large_step, after, sums):
-    """Advance a path by one pixel: write its costs into after, add them to sums and return the least cost."""
+def _step(before, least, costs, large_step, after, kept, sums):
+    """Advance a path by one pixel: write its costs into after, and return the least one.
+
+    They are added to the bits `kept` of sums.
+    """
     limit = np.uint16(least + large_step)
     lowest = _NEVER
     after[0] = _NEVER
@@ -264,7 +267,7 @@ def _step(before, least, costs, large_step, after, sums):
         beside = np.uint16(min(before[i], before[i + 2]) + np.uint16(SMALL_STEP))
         cost = np.uint16(min(min(before[i + 1], beside), limit) - least + np.uint16(costs[i]))
         after[i + 1] = cost
-        sums[i] = np.uint16(sums[i] + cost)
+        sums[i] = np.uint16(np.uint16(sums[i] & kept) + cost)
         lowest = min(lowest, cost)
     return lowest
 
@@ -300,14 +303,14 @@ def along_rows(costs, own, search, large_step, levels, first, last, sums):
                 elif i > 0 and x_before // TILE_PX != x // TILE_PX:
                     _close(before, firsts[y // TILE_PX, x_before // TILE_PX])
                 end = place + levels - skipped
-                if 2 * i + backwards < width:  # the first path to arrive here
-                    sums[place:end] = 0
+                is_first = 2 * i + backwards < width  # of the two paths here
                 leasts[backwards] = _step(
                     before[skipped:],
                     leasts[backwards],
                     costs[place:end],
                     large_step[y, min(x + backwards, width - 1)],
                     after[skipped:],
+                    _NOTHING if is_first else _HIGHEST,
                     sums[place:end],
                 )
 
@@ -382,6 +385,7 @@ def along_columns(costs, own, search, large_step, levels, first_px, first, last,
                     costs[place:end],
                     large_step[y_step, x],
                     paths[after + skipped : after + size],
+                    _HIGHEST,
                     sums[place:end],
                 )
                 if backwards:
