@@ -102,8 +102,8 @@ def make_bitcode(assembly: str) -> bytes:
 def _annotate_arguments(assembly: str) -> str:
     """Return the code of a kernel with what Numba does not know of the arrays that it is given.
 
-    They have no owner that counts references to them (`shipped_kernels.flatten`), and do not overlap
-    (`jit.Kernel`).
+    They have no owner that counts references to them (`shipped_kernels.flatten`), and those that are written
+    overlap no others (`jit.Kernel`).
     """
 
     def annotate(kernel: re.Match[str]) -> str:
