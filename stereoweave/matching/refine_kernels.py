@@ -108,8 +108,8 @@ def bits(code):
     pairs = np.uint32(code - ((code >> _ONE) & _PAIRS))
     fours = np.uint32((pairs & _FOURS) + ((pairs >> _TWO) & _FOURS))
     count = np.uint32(np.uint32(((fours + (fours >> _FOUR)) & _EIGHTS) * _SUM) >> _TOP)
-    # Without this limit, LLVM joins the shift with what the caller does, and no longer recognises a count of
-    # bits, for which recent processors have an instruction.
+    # The limit is never exceeded. It keeps LLVM from joining this shift with the caller's arithmetic, so that
+    # LLVM recognises a count of bits, for which recent processors have an instruction.
     return np.int32(min(count, _WORD))
 
 
@@ -131,7 +131,10 @@ def _difference(level, dark, bright, there, dark_there, bright_there):
 @inlined
 @typing.no_type_check
 def _add_differences(level, dark, bright, levels, darks, brights, kept, costs):
-    """Add a channel's difference to the bits `kept` of each candidate's cost."""
+    """Add a channel's difference to each candidate's cost, of which the bits in the mask `kept` count.
+
+    With a mask of 0 costs are overwritten, so they need not be initialised.
+    """
     for i in range(costs.shape[0]):
         difference = _difference(level, dark, bright, levels[i], darks[i], brights[i])
         costs[i] = np.uint8(np.uint8(costs[i] & kept) + difference)
@@ -151,7 +154,7 @@ def _pull(prior, trust, candidate):
 
 @inlined
 @typing.no_type_check
-def _add_rest(weight, code, prior, trust, codes, priors, trusts, first, costs):
+def _complete(weight, code, prior, trust, codes, priors, trusts, first, costs):
     """Multiply each candidate's cost by half the weight, and add what does not depend on colours.
 
     This is twice the Hamming distance between the census codes, and the cost of the candidate's distance to
@@ -222,7 +225,7 @@ def match(own, other, search, towards, levels, first, last, costs):
                     np.uint8(255 if i else 0),
                     out,
                 )
-            _add_rest(
+            _complete(
                 weight,
                 own.census[y, x],
                 own.prior[y, x],
@@ -258,7 +261,8 @@ def _close(path, first):
 def _step(before, least, costs, large_step, after, kept, sums):
     """Advance a path by one pixel: write its costs into after, and return the least one.
 
-    They are added to the bits `kept` of sums.
+    They are added to sums, of which the bits in the mask `kept` count. With a mask of 0 sums are overwritten,
+    so they need not be initialised.
     """
     limit = np.uint16(least + large_step)
     lowest = _NEVER

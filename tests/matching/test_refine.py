@@ -275,7 +275,7 @@ def test_the_kernels_equal_the_plain_ones(rng, width, in_colour):
         refining.find_searched(given.disparity_px, given.confidence, -1, refining.WIDE), searched
     )
     search, size = refining._lay_out(np.zeros((1, 2), np.int32), searched, count)
-    costs = np.empty(size, np.uint8)
+    costs = np.full(size, 255, np.uint8)
     kernels.match(own, refining._align(other, first_px, count, -1, 2), search, -1, count, 0, 24, costs)
     expected = plain_costs(own, other, first_px, count)
     np.testing.assert_array_equal(costs, expected[searched].ravel())
@@ -283,6 +283,19 @@ def test_the_kernels_equal_the_plain_ones(rng, width, in_colour):
     expected_px = plain_pick(plain_sums(expected, own, searched), first_px)
     np.testing.assert_allclose(found_px[searched], expected_px[searched], atol=1e-5)
     np.testing.assert_allclose(found_px[~searched], given.disparity_px[~searched], atol=1 / 16)
+
+
+def test_paths_overwrite_what_was_in_their_sums(rng):
+    left, _, given = random_pair(rng)
+    searched = np.ones((24, 50), bool)
+    searched[8:16, 14:36] = False
+    search, size = refining._lay_out(np.zeros((1, 1), np.int32), searched, 32)
+    own = refining._cues(left, given.disparity_px, -4, given.confidence)
+    costs, steps = rng.integers(0, 200, size, np.uint8), rng.integers(20, 60, (24, 50), np.uint8)
+    clean, dirty = np.zeros(size, np.uint16), rng.integers(0, 65536, size, np.uint16)
+    for sums in (clean, dirty):
+        kernels.along_rows(costs, own, search, steps, 32, 0, 24, sums)
+    np.testing.assert_array_equal(clean, dirty)
 
 
 @pytest.mark.parametrize("moved_px", [0, -20])
