@@ -289,7 +289,7 @@ def test_paths_overwrite_what_was_in_their_sums(rng):
     left, _, given = random_pair(rng)
     searched = np.ones((24, 50), bool)
     searched[8:16, 14:36] = False
-    search, size = refining._lay_out(np.zeros((1, 1), np.int32), searched, 32)
+    search, size = refining._lay_out(np.zeros((1, 2), np.int32), searched, 32)
     own = refining._cues(left, given.disparity_px, -4, given.confidence)
     costs, steps = rng.integers(0, 200, size, np.uint8), rng.integers(20, 60, (24, 50), np.uint8)
     clean, dirty = np.zeros(size, np.uint16), rng.integers(0, 65536, size, np.uint16)
