@@ -97,6 +97,8 @@ class StereoPictureTab:
             _describe,
             self._kind,
             [self._viewing, self._crops],
+            # By default, a choice made before the answer to the last one has come would be ignored.
+            trigger_mode="always_last",
             **AT_ONCE,
         )
         return [
