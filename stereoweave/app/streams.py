@@ -1,9 +1,10 @@
-"""Middleware that delays new events until the window has read the end of its stream of results."""
+"""Middleware that makes each stream of results reach its window whole."""
 
 import asyncio
 from collections import defaultdict
 from contextlib import suppress
 
+from starlette.datastructures import MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from stereoweave.app.access import API, find_visitor
@@ -22,6 +23,9 @@ class EndedStreams:
     starts an event before it has read this end opens no new stream, so it would wait forever. A window that
     has read the end disconnects. Visitors are told apart by the cookie of `OwnFiles`. Without a cookie,
     nothing is delayed.
+
+    No stream is cached. Chromium lets a request wait for an unfinished one for the same URL, and sometimes
+    sends it twice; what the server sends on the one that nobody reads would be lost.
     """
 
     def __init__(self, app: ASGIApp) -> None:
@@ -31,6 +35,8 @@ class EndedStreams:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         path = scope.get("path")
+        if path == _STREAM:
+            send = _forbid_caching(send)
         visitor = find_visitor(scope) if path in (_STREAM, _JOIN) else ""
         if visitor and path == _STREAM:
             await self._stream(visitor, scope, receive, send)
@@ -69,6 +75,15 @@ class EndedStreams:
             await send(message)
 
         return wait_and_send
+
+
+def _forbid_caching(send: Send) -> Send:
+    async def send_uncached(message: Message) -> None:
+        if message["type"] == "http.response.start":
+            MutableHeaders(scope=message)["Cache-Control"] = "no-store"
+        await send(message)
+
+    return send_uncached
 
 
 async def _wait_for_disconnection(receive: Receive) -> None:

@@ -2,9 +2,14 @@
 
 import asyncio
 import json
-from contextlib import suppress
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 
 import pytest
+import uvicorn
+from browsers import chromium
 
 from stereoweave.app import streams
 from stereoweave.app.streams import EndedStreams
@@ -12,6 +17,16 @@ from stereoweave.app.streams import EndedStreams
 STREAM, JOIN = "/gradio_api/queue/data", "/gradio_api/queue/join"
 RESULT = b'data: {"msg":"process_completed","output":"close_stream"}\n\n'
 END = b'data: {"msg":"close_stream","event_id":null}\n\n'
+# Leaves a stream and opens the next one 100 times, as the page does at the end of each stream.
+REOPEN = """async path => {
+    for (let count = 0; count < 100; count++) {
+        const leaving = new AbortController();
+        const stream = await fetch(path, { signal: leaving.signal });
+        await stream.body.getReader().read();
+        await new Promise(resolve => setTimeout(resolve, count % 10));
+        leaving.abort();
+    }
+}"""
 COOKIES = ["a" * 43, "b" * 43]
 
 
@@ -54,6 +69,18 @@ def run(scenario):
             await scenario(EndedStreams(answer))
 
     asyncio.run(run_in_time())
+
+
+@contextmanager
+def serving(app: Callable) -> Iterator[str]:
+    """Serve an application in a thread; yield its address."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        server = uvicorn.Server(uvicorn.Config(app, log_level="critical", lifespan="off"))
+        thread = threading.Thread(target=server.run, args=([listener],))
+        thread.start()
+        yield f"http://127.0.0.1:{listener.getsockname()[1]}"
+        server.should_exit = True
+        thread.join()
 
 
 async def settle():
@@ -139,3 +166,23 @@ def test_other_requests_pass_through():
         assert json.loads(other.sent[0]) == {"event_id": "1"}
 
     run(scenario)
+
+
+def test_a_browser_requests_each_stream_once():
+    requested = 0
+
+    async def stream(scope, receive, send):
+        nonlocal requested
+        await send({"type": "http.response.start", "status": 200, "headers": []})
+        await send({"type": "http.response.body", "body": RESULT, "more_body": True})
+        if scope["path"] == STREAM:
+            requested += 1
+            while (await receive())["type"] != "http.disconnect":
+                pass
+        await send({"type": "http.response.body", "body": b""})
+
+    with serving(EndedStreams(stream)) as address, chromium() as browser:
+        page = browser.new_page()
+        page.goto(address)
+        page.evaluate(REOPEN, STREAM)
+    assert requested == 100
