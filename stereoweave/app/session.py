@@ -1,5 +1,6 @@
 """Matching, drawing, measurement and output for a visitor to the web page, without the user interface."""
 
+import asyncio
 import zipfile
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -44,6 +45,7 @@ class Session:
         renderer: Renderer of views of that pair.
         folder: Folder of the result's files.
         stereo_pictures: The 3-D pictures made so far.
+        making: Lock of whoever makes one: the visitor sees that of the last choice, and none is made twice.
     """
 
     result: Result
@@ -53,6 +55,7 @@ class Session:
     renderer: Renderer
     folder: Path
     stereo_pictures: dict[Wish, StereoPicture] = field(default_factory=dict)
+    making: asyncio.Lock = field(default_factory=asyncio.Lock)
 
     @property
     def is_written(self) -> bool:

@@ -132,17 +132,19 @@ class StereoPictureTab:
             crops=given[self._crops],
             position=given[self._position],
         ).plain()
-        if wish not in session.stereo_pictures:
-            work = partial(write_stereo_picture, wish, session.result, session.folder / uuid4().hex)
-            try:
-                session.stereo_pictures[wish] = await self._host.work(request, work, progress, self._cancel)
-            except Cancelled:
-                return {self._viewing: viewing}
-            except (StereoweaveError, OSError) as error:
-                if self._sessions.keeps(key, session):
-                    return {self._viewing: self._wording.format_error(error), **self.empty()}
-            if not self._sessions.keeps(key, session):
-                return {self._viewing: format_paragraphs([GONE]), **self.empty()}
+        try:
+            async with session.making:
+                if wish not in session.stereo_pictures:
+                    work = partial(write_stereo_picture, wish, session.result, session.folder / uuid4().hex)
+                    made = await self._host.work(request, work, progress, self._cancel)
+                    session.stereo_pictures[wish] = made
+        except Cancelled:
+            return {self._viewing: viewing}
+        except (StereoweaveError, OSError) as error:
+            if self._sessions.keeps(key, session):
+                return {self._viewing: self._wording.format_error(error), **self.empty()}
+        if not self._sessions.keeps(key, session):
+            return {self._viewing: format_paragraphs([GONE]), **self.empty()}
         made = session.stereo_pictures[wish]
         size_mb = made.file.stat().st_size / 1e6
         label = f"Download {made.file.name} ({size_mb:.1f} MB)"

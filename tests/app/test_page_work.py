@@ -368,6 +368,22 @@ def test_a_window_that_reads_the_end_of_a_stream_late_loses_no_results(browser, 
             make_picture(visit, kind, tmp_path)
 
 
+def test_a_3_d_picture_that_is_asked_for_twice_at_once_is_made_once(browser, pair, tmp_path):
+    server, address = start(tmp_path)
+    with visiting(browser, address) as visit:
+        visit.give(**pair)
+        visit.page.get_by_label("fast").check()
+        visit.find()
+        workers = workers_of(server.pid)
+        visit.open("3-D picture")
+        visit.choose("kind", KINDS["sweep"].label)
+        visit.open("View")
+        visit.open("3-D picture")
+        visit.page.locator("#picture").get_by_text(" left_sweep").wait_for()
+        assert workers_of(server.pid) == workers  # none was started for the second
+    assert stop(server) == ""
+
+
 def test_all_kinds_of_3_d_pictures_are_tested():
     assert {*STILLS, "viewer"} == set(KINDS)
 

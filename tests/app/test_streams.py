@@ -168,6 +168,8 @@ def test_other_requests_pass_through():
     run(scenario)
 
 
+@pytest.mark.system
+@pytest.mark.needs_chromium
 def test_a_browser_requests_each_stream_once():
     requested = 0
 
