@@ -79,6 +79,11 @@ def test_only_the_refinements_keep_weights_of_32_bits(small_pairs, tmp_path):
     assert {name.split(".")[0] for name in kept} == {"refinement", "enlargement"}
 
 
+def test_wider_ranges_are_tried_where_narrow_ones_lose_too_much(small_pairs, tmp_path, monkeypatch):
+    monkeypatch.setattr(quantise, "_RANGE_PERCENTILES", (1.0, 99.99))
+    assert quantise.quantise(SMALL, tmp_path / "small8.onnx")["range_percentile"] == 99.99
+
+
 def test_nothing_is_written_if_8_bits_lose_too_much(small_pairs, tmp_path, monkeypatch):
     monkeypatch.setattr(quantise, "LARGEST_LOSS_PX", -10.0)
     message = complaint(quantise.quantise, SMALL, tmp_path / "small8.onnx")
