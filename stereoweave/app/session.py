@@ -45,7 +45,7 @@ class Session:
         renderer: Renderer of views of that pair.
         folder: Folder of the result's files.
         stereo_pictures: The 3-D pictures made so far.
-        making: Lock of whoever makes one: the visitor sees that of the last choice, and none is made twice.
+        making: Held while one is made: each is made once, and a later choice is answered later.
     """
 
     result: Result

@@ -368,7 +368,7 @@ def test_a_window_that_reads_the_end_of_a_stream_late_loses_no_results(browser, 
             make_picture(visit, kind, tmp_path)
 
 
-def test_a_3_d_picture_that_is_asked_for_twice_at_once_is_made_once(browser, pair, tmp_path):
+def test_a_3_d_picture_that_is_asked_for_twice_at_once_takes_one_process(browser, pair, tmp_path):
     server, address = start(tmp_path)
     with visiting(browser, address) as visit:
         visit.give(**pair)
