@@ -344,7 +344,9 @@ def test_a_scenes_own_calibration_is_used_unless_one_is_given_for_all_scenes(tmp
     job = DepthJob(request=Request(calibration=calibration))
     run_quietly(folder, tmp_path / "other", job, processes=1)
     other_mm = read_pixels(tmp_path / "other" / "room" / "depth.png", "I;16")
-    assert np.median(other_mm / own_mm) == pytest.approx(2, rel=1e-3)
+    known = (own_mm > 0) & (other_mm > 0)
+    assert known.mean() > 0.9
+    assert np.median(other_mm[known] / own_mm[known]) == pytest.approx(2, rel=1e-3)
 
 
 def test_a_focal_length_and_a_baseline_replace_a_scenes_own_calibration(tmp_path):

@@ -38,13 +38,15 @@ def test_a_photograph_beside_a_black_picture_is_not_trusted():
 
 @pytest.mark.parametrize("spread", [2, 10, 40, None])
 def test_noise_is_not_trusted(rng, spread):
-    if spread is None:
-        left, right = rng.integers(0, 256, (2, *SIZE, 3), np.uint8)
-    else:
-        left, right = np.clip(rng.normal(128, spread, (2, *SIZE, 3)), 0, 255).astype(np.uint8)
-    confidence = estimate(left, right).confidence
-    assert confidence.mean() < 0.4
-    assert (confidence > 0.5).mean() < 0.1
+    found = []
+    for _ in range(8):  # single pairs differ by a factor of two
+        if spread is None:
+            left, right = rng.integers(0, 256, (2, *SIZE, 3), np.uint8)
+        else:
+            left, right = np.clip(rng.normal(128, spread, (2, *SIZE, 3)), 0, 255).astype(np.uint8)
+        found.append(estimate(left, right).confidence)
+    assert np.mean(found) < 0.4
+    assert (np.array(found) > 0.5).mean() < 0.1
 
 
 def test_identical_pictures_are_at_disparity_0():
